@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The metadata that every bake carries, so that it can be decoded years later from itself alone."""
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, fields
+
+from .errors import UserError
+
+SCHEMA = 1
+VERSION = "0.1.0"
+BASIS = "real orthonormal SH, no Condon-Shortley phase, k = l*(l+1)+m; radiance = albedo * (T . L)"
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class BakeRecord:
+    """What was baked, how, and how well."""
+
+    method: str
+    order: int
+    points: int
+    domain: str                       # 'POINT' or 'CORNER'
+    rays: int                         # traced in all
+    seed: int
+    seconds: float                    # arrays to coefficients, wall clock
+    error_estimate: float | None      # rel L2, measured; None: nothing was sampled
+    tolerance: float | None = None    # rel L2 that was asked for; None: a ray count was
+    occluders: str = "SELF"           # 'SELF', 'VISIBLE' or a collection's name
+    fingerprint: str = ""             # of the shape and its occluders
+    frame: tuple[float, ...] = IDENTITY  # (9,) row-major rotation of the object at bake time
+    target: str = "vertices"
+    bounces: int = 0
+    basis: str = BASIS
+    version: str = VERSION
+    schema: int = SCHEMA
+
+    @property
+    def rays_per_point(self) -> float:
+        """Mean number of rays a point took."""
+        return self.rays / max(self.points, 1)
+
+    def to_json(self) -> str:
+        """One line of JSON."""
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @staticmethod
+    def from_json(text: str) -> BakeRecord:
+        """The record in `text`. Raises UserError where it is unreadable or of a newer schema."""
+        try:
+            data = json.loads(text)
+            schema = int(data["schema"])
+        except (ValueError, TypeError, KeyError) as error:
+            raise UserError("The record of this bake is unreadable; bake again.") from error
+        if schema > SCHEMA:
+            raise UserError(f"This bake was made by a newer Neural GASh ({data.get('version', 'unknown')}); "
+                            "update the add-on to use it.")
+        known = {f.name for f in fields(BakeRecord)}
+        try:
+            record = BakeRecord(**{key: value for key, value in data.items() if key in known})
+        except TypeError as error:
+            raise UserError("The record of this bake is incomplete; bake again.") from error
+        if len(record.frame) != 9 or not 1 <= record.order <= 16:
+            raise UserError("The record of this bake is damaged; bake again.")
+        object.__setattr__(record, "frame", tuple(float(v) for v in record.frame))
+        return record
