@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The traced blocked part of transfer at many points, over worker threads.
+
+B[k] = 1/pi int (1 - V(w)) max(n.w, 0) Y_k(w) dw is the mean of Y_k over the blocked ones of
+cosine-distributed directions. Each point sees one of SETS scrambled nets in a frame of its own,
+turned at random about its normal, so neighbours' errors are independent. Sums are kept in the
+local frame, where they are one matrix product for many points, and rotated once at the end.
+"""
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Generator, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import sampling
+from . import spherical_harmonics as sh
+from .geometry import TriangleMesh
+from .raycast import Occluders
+
+SETS = 32
+MAX_RAYS = 4096
+RAYS_PER_JOB = 1 << 16  # about 15 ms of one thread: short enough to stop at once, long enough to be efficient
+
+
+class BlockedEstimator:
+    """Sums of Y_k over blocked rays, in each point's local frame."""
+
+    def __init__(self, mesh: TriangleMesh, occluders: Occluders, order: int, seed: int, rays: int) -> None:
+        """rays: the most that any point will take. seed: independent seeds give independent estimates."""
+        rng = np.random.default_rng([seed, 0])
+        self._occluders = occluders
+        self._order = order
+        self._sets = sampling.hemisphere_sets(SETS, rays, int(rng.integers(2**31)))
+        self._origins = occluders.origins(mesh.points, mesh.normals, mesh.insets)
+        self._normals = mesh.normals
+        self._angles = rng.uniform(0, 2 * np.pi, len(mesh.points)).astype(np.float32)
+        self._set_of_point = rng.integers(0, SETS, len(mesh.points), dtype=np.uint8)
+        self._stop = threading.Event()
+
+    def trace(self, pool: ThreadPoolExecutor, threads: int, points: NDArray, start: int, stop: int,
+              sums: NDArray[np.float64]) -> Generator[float, None, None]:
+        """Add directions start..stop of each point to its sum.
+
+        Args:
+            points: (n,) indices of points, in an order that is coherent in space.
+            sums: (n, K) accumulated in place.
+        Yields:
+            The share of the rays done, after every job. Closing the generator stops the workers.
+        """
+        jobs = self._jobs(points, start, stop)
+        total = len(points)
+        pending: dict[Future, NDArray] = {}
+        done = 0
+        try:
+            while True:
+                while len(pending) < 2 * threads and (job := next(jobs, None)) is not None:
+                    rows, tables = job
+                    pending[pool.submit(self._blocked_sums, points[rows], *tables)] = rows
+                if not pending:
+                    return
+                for future in wait(pending, return_when=FIRST_COMPLETED).done:
+                    rows = pending.pop(future)
+                    sums[rows] += future.result()
+                    done += len(rows)
+                yield done / total
+        finally:
+            if pending:  # closed or failed half-way
+                self._stop.set()
+                for future in pending:
+                    future.cancel()
+                wait(pending)
+                self._stop.clear()
+
+    def _jobs(self, points: NDArray, start: int, stop: int) -> Iterator[tuple[NDArray, tuple[NDArray, NDArray]]]:
+        """Rows of `points` that share a set, with its tables for directions start..stop."""
+        size = max(1, RAYS_PER_JOB // (stop - start))
+        set_of_row = self._set_of_point[points]
+        rows_by_set = np.argsort(set_of_row, kind="stable")
+        bounds = np.searchsorted(set_of_row[rows_by_set], np.arange(SETS + 1))
+        for s in range(SETS):
+            rows = rows_by_set[bounds[s]:bounds[s + 1]]
+            if not len(rows):
+                continue
+            local = self._sets[s, start:stop]
+            # (9, 3r): frame (row-major, 9) @ lift = the r directions' world coordinates in a row,
+            # so that one matrix product makes the rays of many points in the layout Embree reads
+            lift = np.einsum("cd,ja->cajd", np.eye(3), local).reshape(9, -1).astype(np.float32)
+            harmonics = sh.evaluate(local, self._order).astype(np.float32)
+            for first in range(0, len(rows), size):
+                yield rows[first:first + size], (lift, harmonics)
+
+    def _blocked_sums(self, points: NDArray, lift: NDArray, harmonics: NDArray) -> NDArray[np.float64]:
+        """Worker: (n, K) sums of Y_k over the blocked ones of these directions at these points."""
+        if self._stop.is_set():
+            return np.zeros((len(points), harmonics.shape[1]))
+        frames = self.frames(points).reshape(-1, 9).astype(np.float32)
+        count = len(harmonics)
+        directions = (frames @ lift).reshape(-1, 3)
+        origins = np.repeat(self._origins[points], count, axis=0)
+        free = self._occluders.blocked(origins, directions)  # 0 blocked, -1 free
+        blocked = np.add(free, 1, dtype=np.float32, casting="unsafe").reshape(-1, count)
+        return (blocked @ harmonics).astype(np.float64)
+
+    def frames(self, points: NDArray) -> NDArray[np.float64]:
+        """(n, 3, 3) local-to-world rotations of these points."""
+        return sampling.frames(self._normals[points], self._angles[points].astype(np.float64))
+
+
+def default_threads() -> int:
+    """One worker a core this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def morton_order(points: NDArray) -> NDArray[np.int64]:
+    """Indices (N,) that walk the points (N, 3) along a Z-order curve: neighbours in it are near in space."""
+    low = points.min(0)
+    extent = float((points.max(0) - low).max()) or 1.0
+    cells = np.minimum((points - low) / extent * 2**20, 2**20 - 1).astype(np.uint64)
+    code = np.zeros(len(points), dtype=np.uint64)
+    for axis in range(3):
+        x = cells[:, axis]
+        for shift, mask in ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
+                            (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)):
+            x = (x | (x << np.uint64(shift))) & np.uint64(mask)
+        code |= x << np.uint64(axis)
+    return np.argsort(code, kind="stable")

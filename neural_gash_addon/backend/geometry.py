@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The mesh to bake as arrays: geometry that blocks, and the points whose transfer is wanted.
+
+A point is a vertex, unless the shading has split normals; then each distinct (vertex, normal)
+is a point, and the face corners that share it read the same coefficients.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import UserError
+
+POINT, CORNER = "POINT", "CORNER"
+
+# Corner normals of one vertex closer than this are one normal: above float32 noise of averaged
+# normals, below any split that can be seen (0.06 degrees).
+SAME_NORMAL = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleMesh:
+    """A mesh in the bake frame (world axes, metres) and its N points."""
+
+    positions: NDArray[np.float64]  # (V, 3) vertices
+    triangles: NDArray[np.int32]    # (F, 3)
+    points: NDArray[np.float64]     # (N, 3)
+    normals: NDArray[np.float64]    # (N, 3) unit shading normals; zero where there is none
+    insets: NDArray[np.float64]     # (N, 3) tangent direction (at most unit) into the point's own faces
+    elements: NDArray[np.int32]     # (E,) point of each vertex (POINT) or face corner (CORNER)
+    domain: str                     # POINT or CORNER, Blender's attribute domains
+    resolution: float               # spacing of the coordinates' floats, metres
+
+    @staticmethod
+    def from_corners(positions: NDArray, triangles: NDArray, corner_vertices: NDArray, corner_normals: NDArray,
+                     corner_faces: NDArray, resolution: float | None = None) -> TriangleMesh:
+        """Decide the domain from the shading, and build the points.
+
+        Args:
+            positions: (V, 3). triangles: (F, 3) vertex indices, as many as trace.
+            corner_vertices: (C,) vertex of each polygon corner. corner_normals: (C, 3) its shading
+                normal. corner_faces: (C,) its polygon, non-decreasing.
+            resolution: spacing of the floats the coordinates came in; float32's at the largest
+                coordinate where not given.
+        Raises:
+            UserError: no faces, or coordinates that are not finite.
+        """
+        positions = np.ascontiguousarray(positions, dtype=np.float64)
+        triangles = np.ascontiguousarray(triangles, dtype=np.int32)
+        corner_vertices = np.asarray(corner_vertices)
+        if not len(triangles) or not len(corner_vertices):
+            raise UserError("The mesh has no faces, so there is nothing to bake.")
+        if not np.isfinite(positions).all():
+            raise UserError("The mesh has coordinates that are infinite or not numbers.")
+        if resolution is None:
+            resolution = float(np.spacing(np.float32(np.abs(positions).max())))
+        normals = _unit(corner_normals)
+        vertex_normals = np.zeros_like(positions)
+        vertex_normals[corner_vertices] = normals  # any one corner's, to compare the others with
+        split = np.abs(normals - vertex_normals[corner_vertices]).max(initial=0.0) > SAME_NORMAL
+        if not split:
+            count = len(positions)
+            return TriangleMesh(positions, triangles, positions, vertex_normals, np.zeros((count, 3)),
+                                np.arange(count, dtype=np.int32), POINT, resolution)
+        first, elements = _distinct(corner_vertices, normals)
+        point_vertices = corner_vertices[first]
+        insets = _insets(positions, corner_vertices, corner_faces, elements, normals[first], point_vertices)
+        return TriangleMesh(positions, triangles, positions[point_vertices], normals[first], insets,
+                            elements.astype(np.int32), CORNER, resolution)
+
+    @staticmethod
+    def from_triangles(positions: NDArray, triangles: NDArray, smooth: bool = True) -> TriangleMesh:
+        """A triangle soup shaded smooth (angle-weighted normals, as Blender's) or flat; see `from_corners`."""
+        positions = np.asarray(positions, dtype=np.float64)
+        triangles = np.asarray(triangles, dtype=np.int32)
+        if not len(triangles):
+            raise UserError("The mesh has no faces, so there is nothing to bake.")
+        corners = positions[triangles]                                   # (F, 3, 3)
+        face_normals = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+        corner_normals = np.repeat(face_normals, 3, axis=0)
+        if smooth:
+            following = _unit(np.roll(corners, -1, 1) - corners)
+            angles = np.arccos(np.clip(-(following * np.roll(following, 1, 1)).sum(-1), -1, 1))
+            vertex_normals = np.zeros_like(positions)
+            np.add.at(vertex_normals, triangles.ravel(), corner_normals * angles.reshape(-1, 1))
+            corner_normals = _unit(vertex_normals)[triangles.ravel()]
+        faces = np.repeat(np.arange(len(triangles)), 3)
+        return TriangleMesh.from_corners(positions, triangles, triangles.ravel(), corner_normals, faces)
+
+
+def _unit(vectors: NDArray) -> NDArray[np.float64]:
+    """Vectors (..., 3) scaled to length 1; zero where they are zero or not finite."""
+    v = np.asarray(vectors, dtype=np.float64)
+    length = np.linalg.norm(v, axis=-1, keepdims=True)
+    good = np.isfinite(length) & (length > 0)
+    return np.divide(v, length, out=np.zeros_like(v), where=good)
+
+
+def _distinct(corner_vertices: NDArray, normals: NDArray) -> tuple[NDArray, NDArray]:
+    """Corners grouped by vertex and (nearly) equal normal: first corner of each group, group of each corner.
+
+    Equal is decided on a grid of SAME_NORMAL, so a pair across a cell's border may stay apart:
+    that costs a point, never a wrong one.
+    """
+    cells = np.rint(normals / SAME_NORMAL).astype(np.int64) + 2000
+    key = ((cells[:, 0] * 4001 + cells[:, 1]) * 4001) + cells[:, 2]
+    order = np.lexsort((key, corner_vertices))
+    v, k = corner_vertices[order], key[order]
+    starts = np.concatenate([[True], (v[1:] != v[:-1]) | (k[1:] != k[:-1])])
+    elements = np.empty(len(order), dtype=np.int64)
+    elements[order] = np.cumsum(starts) - 1
+    return order[starts], elements
+
+
+def _insets(positions: NDArray, corner_vertices: NDArray, corner_faces: NDArray, elements: NDArray,
+            point_normals: NDArray, point_vertices: NDArray) -> NDArray[np.float64]:
+    """Tangent directions from each point into the faces it belongs to: (N, 3), length at most 1.
+
+    A corner of a flat wall lies in the plane of the next wall too; a ray that starts exactly there
+    may pass behind it. A step into the point's own faces settles on which side it is.
+    """
+    _, face_index = np.unique(corner_faces, return_inverse=True)
+    size = np.bincount(face_index)
+    centres = np.stack([np.bincount(face_index, positions[corner_vertices, a]) for a in range(3)], 1) / size[:, None]
+    towards = _unit(centres[face_index] - positions[corner_vertices])
+    count = len(point_vertices)
+    mean = np.stack([np.bincount(elements, towards[:, a], count) for a in range(3)], 1)
+    mean -= (mean * point_normals).sum(1, keepdims=True) * point_normals
+    return _unit(mean)

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The table of methods: one entry each, from which the menu, the command line and the charts are read."""
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import embree_bake
+from . import spherical_harmonics as sh
+from .errors import UserError
+from .estimator import MAX_RAYS
+from .geometry import TriangleMesh
+from .raycast import Geometry
+from .record import BakeRecord
+from .transfer import Transfer
+
+Baking = Generator[float, None, Transfer]
+MIN_ORDER = 2
+MIN_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to get transfer."""
+
+    name: str
+    label: str
+    description: str
+    traces: bool  # takes rays or a tolerance, and sees occluders
+    bake: Callable[..., Baking]
+
+
+def _analytic(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
+              occluders: Sequence[Geometry], seed: int, threads: int | None) -> Baking:
+    """Unshadowed transfer, exact; only `mesh` and `order` matter."""
+    began = time.perf_counter()
+    coefficients = np.empty((len(mesh.points), sh.coefficient_count(order)), dtype=np.float32)
+    for start in range(0, len(coefficients), embree_bake.BLOCK):
+        part = slice(start, start + embree_bake.BLOCK)
+        coefficients[part] = sh.cosine_lobe(mesh.normals[part], order)
+        yield min(1.0, (start + embree_bake.BLOCK) / len(coefficients))
+    return Transfer(coefficients, BakeRecord(
+        method="analytic", order=order, points=len(mesh.points), domain=mesh.domain, rays=0, seed=seed,
+        seconds=time.perf_counter() - began, error_estimate=None))
+
+
+METHODS: dict[str, Method] = {m.name: m for m in (
+    Method("analytic", "Unshadowed", "Exact shading of the normals alone, without any shadows; instant",
+           traces=False, bake=_analytic),
+    Method("embree", "Ray traced", "Traces rays with Embree to find what blocks the light; the reference",
+           traces=True, bake=embree_bake.bake),
+)}
+
+
+def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: int | None = None,
+         tolerance: float | None = None, occluders: Sequence[Geometry] = (), seed: int = 0,
+         threads: int | None = None) -> Baking:
+    """Bake the transfer of a mesh's points.
+
+    Args:
+        mesh: what to bake; it blocks its own light.
+        method: a name in METHODS. order: bands, 2 to 5.
+        rays: rays for every point, or
+        tolerance: relative L2 error to reach with as few rays as that takes (at most MAX_RAYS a
+            point). A method that traces wants exactly one of the two.
+        occluders: what else blocks, parts (positions (V, 3), triangles (F, 3)) in the same frame.
+        seed: independent seeds give independent errors. threads: one a core where not given.
+    Yields:
+        Progress, 0 to 1, many times a second. `close()` stops the workers.
+    Returns:
+        Transfer, whose record's frame, occluders and fingerprint are the caller's to fill.
+    Raises:
+        UserError: arguments out of range.
+    """
+    if method not in METHODS:
+        raise UserError(f"There is no method '{method}'; choose one of: {', '.join(METHODS)}.")
+    if not MIN_ORDER <= order <= sh.MAX_ORDER:
+        raise UserError(f"The order must be {MIN_ORDER} to {sh.MAX_ORDER}, not {order}.")
+    entry = METHODS[method]
+    if entry.traces:
+        if (rays is None) == (tolerance is None):
+            raise UserError("Give either a number of rays or a tolerance.")
+        if rays is not None and not 1 <= rays <= 16 * MAX_RAYS:
+            raise UserError(f"The number of rays must be 1 to {16 * MAX_RAYS}, not {rays}.")
+        if tolerance is not None and not MIN_TOLERANCE <= tolerance <= 1:
+            raise UserError(f"The tolerance must be {MIN_TOLERANCE:g} to 1, not {tolerance:g}.")
+    return entry.bake(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed, threads=threads)
+
+
+def run(baking: Baking, progress: Callable[[float], None] | None = None) -> Transfer:
+    """Drive a bake to its end, calling `progress` with the share done (0 to 1)."""
+    try:
+        while True:
+            share = next(baking)
+            if progress:
+                progress(share)
+    except StopIteration as end:
+        return end.value
+    finally:
+        baking.close()

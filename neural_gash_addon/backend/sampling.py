@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Low-discrepancy directions: scrambled Sobol' points on the cosine-weighted hemisphere."""
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def sobol2(count: int) -> NDArray[np.uint32]:
+    """First `count` (at most 2**32) points of the two-dimensional Sobol' sequence: (count, 2) uint32.
+
+    The first dimension is the van der Corput sequence, the second the Pascal matrix modulo 2:
+    every aligned run of 2**m points is a (0, m, 2)-net (Sobol' 1967).
+    """
+    index = np.arange(count, dtype=np.uint32)
+    out = np.zeros((count, 2), dtype=np.uint32)
+    vector = np.uint32(1 << 31)
+    for bit in range(32):
+        set_here = (index >> np.uint32(bit)) & np.uint32(1)
+        out[:, 0] ^= set_here * np.uint32(1 << (31 - bit))
+        out[:, 1] ^= set_here * vector
+        vector ^= vector >> np.uint32(1)
+    return out
+
+
+def owen_scramble(values: NDArray[np.uint32], seeds: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """Nested uniform scramble of 32-bit fractions by hashing (Laine and Karras 2011; Burley 2020).
+
+    Keeps every elementary interval's count and makes the points unbiased. Shapes broadcast.
+    """
+    x = _reverse_bits(values) + seeds
+    for shift_constant in (0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6):
+        x = x ^ (x * np.uint32(shift_constant))
+    return _reverse_bits(x)
+
+
+def _reverse_bits(x: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    for shift, mask in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF)):
+        s, m = np.uint32(shift), np.uint32(mask)
+        x = ((x >> s) & m) | ((x & m) << s)
+    return (x >> np.uint32(16)) | (x << np.uint32(16))
+
+
+@lru_cache(maxsize=4)
+def hemisphere_sets(sets: int, count: int, seed: int) -> NDArray[np.float64]:
+    """Independent scrambles of the same net, mapped to the cosine-weighted hemisphere about +z.
+
+    Args:
+        sets: how many. count: directions in each. seed: which scrambles.
+    Returns:
+        (sets, count, 3) float64 unit vectors, density cos(theta)/pi, z > 0; each aligned run of
+        2**m directions of a set is a net of its own.
+    """
+    seeds = np.random.default_rng(seed).integers(0, 2**32, (sets, 1, 2), dtype=np.uint32)
+    bits = owen_scramble(sobol2(count)[None], seeds)
+    u = (bits.astype(np.float64) + 0.5) / 2**32
+    radius, phi = np.sqrt(u[..., 0]), 2 * np.pi * u[..., 1]
+    return np.stack([radius * np.cos(phi), radius * np.sin(phi), np.sqrt(1 - u[..., 0])], -1)
+
+
+def frames(normals: NDArray, angles: NDArray) -> NDArray[np.float64]:
+    """Rotations that carry +z to each normal, turned by an angle about it.
+
+    Args:
+        normals: (N, 3) unit vectors. angles: (N,) radians.
+    Returns:
+        (N, 3, 3) float64 whose columns are tangent, bitangent and normal. Nowhere singular
+        (Duff et al. 2017, "Building an orthonormal basis, revisited").
+    """
+    x, y, z = np.asarray(normals, dtype=np.float64).T
+    sign = np.where(z >= 0, 1.0, -1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    first = np.stack([1 + sign * x * x * a, sign * b, -sign * x], 1)
+    second = np.stack([b, sign + y * y * a, -y], 1)
+    c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]
+    return np.stack([c * first + s * second, c * second - s * first, np.stack([x, y, z], 1)], 2)
