@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""World matrices as arrays, and the rotation in them: the frame of a bake."""
+from __future__ import annotations
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def as_array(matrix) -> Array:
+    """A mathutils matrix as float64."""
+    return np.array(matrix, dtype=np.float64)
+
+
+def rotation_part(matrix: Array) -> Array:
+    """Nearest rotation (3, 3) to a world matrix (4, 4), by polar decomposition; a mirror's is that of -matrix.
+
+    If an object is only turned by Q between two times, the rotation parts satisfy
+    R_now = Q R_then, also under shear, uneven scale and mirrors.
+    """
+    left, _, right = np.linalg.svd(matrix[:3, :3])
+    rotation = left @ right
+    return rotation if np.linalg.det(rotation) > 0 else -rotation
+
+
+def bake_frame(obj: bpy.types.Object) -> Array:
+    """Rotation part (3, 3) of the object's world matrix, determinant 1."""
+    return rotation_part(as_array(obj.matrix_world))

@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Seeing a bake: each material slot shows its material's colour lit by the baked transfer.
+
+The preview materials sit in object-level slots, so neither the mesh's materials nor other users of
+the mesh change. What a slot held is stored on the preview material in it, so it survives saving,
+reordering of slots, duplicating and joining.
+"""
+from __future__ import annotations
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..backend import spherical_harmonics as sh
+from ..backend.errors import UserError
+from .attributes import attribute_count, has_bake, read_record
+from .frames import bake_frame
+from .nodes import DEFAULT_ALBEDO, ensure_group, group_order, is_group, set_light
+
+_STATE = "neural_gash_preview"  # custom property of a preview material: what its slot held
+EEVEE_ATTRIBUTES = 14           # with 15, EEVEE draws magenta, whatever their types
+_COLOUR_SOCKETS = {"BSDF_PRINCIPLED": "Base Color", "BSDF_DIFFUSE": "Color"}
+_TEXTURES_ON_UV = {"TEX_IMAGE"}
+
+
+def is_on(obj: bpy.types.Object | None) -> bool:
+    """Whether the object shows its bake. Cheap enough to ask while drawing."""
+    return obj is not None and any(_state(slot.material) is not None for slot in obj.material_slots)
+
+
+def preview_on(obj: bpy.types.Object) -> None:
+    """Show the bake of `obj`, lit by a white sky until `update_light`.
+
+    Raises:
+        UserError: there is no bake, or a material's colour reads more attributes than EEVEE can
+            draw beside the bake's.
+    """
+    record = read_record(obj)
+    preview_off(obj)
+    group = ensure_group(record.order)
+    originals = [slot.material for slot in obj.material_slots] or [None]
+    previews: list[bpy.types.Material] = []
+    try:
+        for original in originals:
+            previews.append(_preview_material(original, group))
+            _check_attributes(original, previews[-1], record.order)
+    except UserError:
+        _remove_unused(previews)
+        raise
+    added = not obj.material_slots
+    if added:
+        obj.data.materials.append(None)
+    for slot, original, preview in zip(obj.material_slots, originals, previews, strict=True):
+        state = {"link": slot.link, "added": added}
+        slot.link = "OBJECT"
+        for key, material in (("object", slot.material), ("shown", original)):
+            if material is not None:
+                state[key] = material
+        preview[_STATE] = state
+        slot.material = preview
+
+
+def preview_off(obj: bpy.types.Object) -> None:
+    """Give every slot of `obj` back what it held, and remove what the preview made."""
+    found: set[bpy.types.Material] = set()
+    added = False
+    for slot in obj.material_slots:
+        link = slot.link
+        slot.link = "DATA"
+        state = _state(slot.material)
+        if state is not None:  # only after joining, which moves materials to the mesh
+            found.add(slot.material)
+            slot.material = state.get("shown")
+        slot.link = "OBJECT"
+        state = _state(slot.material)
+        if state is None:
+            slot.link = link
+            continue
+        found.add(slot.material)
+        added = added or bool(state["added"])
+        slot.material = state.get("object")
+        slot.link = state["link"]
+    if added and len(obj.material_slots) == 1:
+        _remove_slot(obj)
+    _remove_unused(found)
+
+
+def update_light(obj: bpy.types.Object, light: NDArray) -> None:
+    """Light the preview of `obj`, where it is on. Sets socket values only, so no shader recompiles.
+
+    Args:
+        light: (K, 3) in world axes, of the bake's order or higher. It is turned into the frame of
+            the bake, so the object may have been rotated since.
+    Raises:
+        UserError: the record of the bake is damaged.
+        ValueError: the light is of a lower order than the bake.
+    """
+    if not (is_on(obj) and has_bake(obj)):
+        return
+    record = read_record(obj)
+    terms = record.order ** 2
+    if len(light) < terms:
+        raise ValueError(f"the light has {len(light)} coefficients, the bake {terms}")
+    turn = np.array(record.frame).reshape(3, 3) @ bake_frame(obj).T
+    seen = sh.rotate(np.asarray(light)[:terms], turn)
+    if any(group_order(node.node_tree) != record.order for node in _group_nodes(obj)):
+        preview_on(obj)  # baked again at another order
+    for slot in obj.material_slots:
+        if _state(slot.material) is not None and slot.material.users > 1:
+            slot.material = slot.material.copy()  # a duplicated object, which may be turned differently
+    for node in _group_nodes(obj):
+        set_light(node, seen)
+
+
+def _state(material: bpy.types.Material | None):
+    """What the slot of a preview material held; None for any other material."""
+    return None if material is None else material.get(_STATE)
+
+
+def _group_nodes(obj: bpy.types.Object) -> list[bpy.types.Node]:
+    """The shading group's nodes in the preview materials of `obj`."""
+    return [node for slot in obj.material_slots if _state(slot.material) is not None
+            for node in slot.material.node_tree.nodes if node.type == "GROUP" and is_group(node.node_tree)]
+
+
+def _has_nodes(material: bpy.types.Material) -> bool:
+    """Whether the material is made of nodes; from 5.0 on all are, and asking warns."""
+    return bpy.app.version >= (5, 0, 0) or material.use_nodes
+
+
+def _preview_material(original: bpy.types.Material | None, group: bpy.types.NodeTree) -> bpy.types.Material:
+    """A material whose surface is the group with the original's colour as albedo."""
+    if original is None or not _has_nodes(original):
+        name = "Material" if original is None else original.name
+        colour = (DEFAULT_ALBEDO,) * 3 + (1.0,) if original is None else tuple(original.diffuse_color)
+        preview = bpy.data.materials.new(f"{name} (PRT preview)")
+        if not _has_nodes(preview):
+            preview.use_nodes = True
+        preview.node_tree.nodes.clear()
+        source = None
+    else:
+        preview = original.copy()
+        preview.name = f"{original.name} (PRT preview)"
+        preview.use_fake_user = False
+        preview.asset_clear()
+        source = _colour_socket(preview.node_tree)
+        colour = (DEFAULT_ALBEDO,) * 3 + (1.0,) if source is None else tuple(source.default_value)
+    tree = preview.node_tree
+    for node in [n for n in tree.nodes if n.type == "OUTPUT_MATERIAL"]:
+        tree.nodes.remove(node)
+    shading = tree.nodes.new("ShaderNodeGroup")
+    shading.node_tree = group
+    shading.inputs["Albedo"].default_value = colour
+    if source is not None and source.is_linked:
+        tree.links.new(source.links[0].from_socket, shading.inputs["Albedo"])
+    output = tree.nodes.new("ShaderNodeOutputMaterial")
+    output.location = (200, 0)
+    tree.links.new(shading.outputs[0], output.inputs["Surface"])
+    if hasattr(preview, "surface_render_method"):
+        preview.surface_render_method = "DITHERED"  # the preview is opaque, whatever the original was
+    return preview
+
+
+def _colour_socket(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket | None:
+    """The colour input of the first Principled or Diffuse shader that reaches the output."""
+    output = next((o for o in map(tree.get_output_node, ("ALL", "EEVEE", "CYCLES")) if o is not None), None)
+    if output is None:
+        return None
+    for node in _upstream(output.inputs["Surface"]):
+        if node.type in _COLOUR_SOCKETS:
+            return node.inputs[_COLOUR_SOCKETS[node.type]]
+    return None
+
+
+def _upstream(*sockets: bpy.types.NodeSocket) -> list[bpy.types.Node]:
+    """The nodes that feed some input sockets, nearest first, each once."""
+    found: dict[bpy.types.Node, None] = {}
+    front = list(sockets)
+    while front:
+        nodes = [link.from_node for socket in front for link in socket.links]
+        front = []
+        for node in nodes:
+            if node not in found:
+                found[node] = None
+                front += node.inputs
+    return list(found)
+
+
+def _check_attributes(original: bpy.types.Material | None, preview: bpy.types.Material, order: int) -> None:
+    """UserError where the preview reads more of the mesh's attributes than EEVEE can draw."""
+    output = preview.node_tree.get_output_node("ALL")
+    reads = _mesh_reads(_upstream(output.inputs["Surface"]))
+    if original is not None and len(reads) > EEVEE_ATTRIBUTES:
+        bake = attribute_count(order)
+        raise UserError(f"The colour of the material '{original.name}' reads {len(reads) - bake} attributes of the "
+                        f"mesh; with the {bake} of an order-{order} bake that is more than the {EEVEE_ATTRIBUTES} "
+                        "that EEVEE draws, so simplify it or bake at a lower order.")
+
+
+def _mesh_reads(nodes: list[bpy.types.Node]) -> set[tuple[str, str]]:
+    """The attributes of the mesh that some shader nodes read, those in their groups too."""
+    reads: set[tuple[str, str]] = set()
+    for node in nodes:
+        if node.type == "GROUP" and node.node_tree is not None:
+            ends = [n for n in node.node_tree.nodes if n.type == "GROUP_OUTPUT"]
+            reads |= _mesh_reads(_upstream(*(socket for end in ends for socket in end.inputs)))
+        elif node.type == "ATTRIBUTE" and node.attribute_type == "GEOMETRY":
+            reads.add(("attribute", node.attribute_name))
+        elif node.type == "VERTEX_COLOR":
+            reads.add(("attribute", node.layer_name))
+        elif node.type == "UVMAP":
+            reads.add(("attribute", node.uv_map))
+        elif node.type in ("TANGENT", "NORMAL_MAP"):
+            reads.add(("tangent", node.uv_map))
+        elif node.type == "TEX_COORD":
+            reads |= {(s.name, "") for s in node.outputs if s.is_linked and s.name in ("UV", "Generated")}
+        elif node.type.startswith("TEX_") and not all(s.is_linked for s in node.inputs if s.name == "Vector"):
+            reads.add(("UV" if node.type in _TEXTURES_ON_UV else "Generated", ""))
+    return reads
+
+
+def _remove_slot(obj: bpy.types.Object) -> None:
+    """Remove the slot that the preview added, unless another user of the mesh shows its bake in it."""
+    for other in bpy.data.objects:
+        if other != obj and other.data == obj.data and is_on(other):
+            for slot in other.material_slots:
+                if _state(slot.material) is not None:
+                    slot.material[_STATE]["added"] = True
+            return
+    data = obj.data
+    before = np.empty(len(data.polygons), np.int32)
+    data.polygons.foreach_get("material_index", before)
+    data.materials.pop(index=0)
+    if before.any():  # faces may name slots that do not exist; popping one renumbers them
+        data.polygons.foreach_set("material_index", before)
+
+
+def _remove_unused(previews) -> None:
+    """Delete preview materials and shading groups that nothing uses any more."""
+    for material in previews:
+        if material.users == 0:
+            bpy.data.materials.remove(material)
+    for group in [g for g in bpy.data.node_groups if is_group(g) and g.users == 0]:
+        bpy.data.node_groups.remove(group)

@@ -1,0 +1,340 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Blender objects to arrays: the mesh to bake, what else blocks its light, and its fingerprint."""
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..backend.errors import UserError
+from ..backend.geometry import TriangleMesh
+from .attributes import discard
+from .evaluation import evaluated, revealed
+from .frames import Array, as_array, bake_frame, rotation_part
+from .preview import preview_off
+
+SELF, VISIBLE = "SELF", "VISIBLE"
+# Stretch and places are compared to this part of their size: far above float32 noise of a turned
+# matrix, far below what changes a shadow.
+_SAME = 1e-4
+
+__all__ = ["SELF", "VISIBLE", "SceneMesh", "bake_frame", "fingerprint", "make_applied_copy", "read_object",
+           "read_occluders", "refusal", "same_fingerprint"]
+
+
+@dataclass(frozen=True, eq=False)
+class SceneMesh:
+    """What `read_object` gives."""
+
+    mesh: TriangleMesh  # in world axes, metres; vertices and corners in Blender's order
+    matrix: Array       # (4, 4) the object's world matrix when it was read
+
+    @property
+    def frame(self) -> tuple[float, ...]:
+        """(9,) row-major rotation for `BakeRecord.frame`."""
+        return tuple(float(v) for v in rotation_part(self.matrix).ravel())
+
+
+def refusal(obj: bpy.types.Object | None) -> str:
+    """Why `obj` cannot be baked at all, in one sentence; '' where it can. Reads no geometry."""
+    if obj is None:
+        return "No object is active; click a mesh object to make it the active one."
+    if obj.type != "MESH":
+        return f"'{obj.name}' is not a mesh object ({obj.type.title()}); convert it to a mesh to bake it."
+    if obj.library or obj.data.library:
+        return (f"'{obj.name}' is linked from another file, where a bake cannot be stored; "
+                "make its object and mesh local to bake it.")
+    if obj.data.override_library:
+        return (f"The mesh of '{obj.name}' is a library override, which cannot store a bake; "
+                "make it local to bake it.")
+    if obj.mode == "EDIT":
+        return f"'{obj.name}' is in Edit Mode, which would discard the bake; leave Edit Mode to bake it."
+    if not obj.data.polygons:
+        return f"'{obj.name}' has no faces, so there is nothing to bake."
+    return ""
+
+
+def read_object(obj: bpy.types.Object | None, depsgraph: bpy.types.Depsgraph) -> SceneMesh:
+    """The object as it stands evaluated, in world axes.
+
+    Raises:
+        UserError: it cannot be baked (see `refusal`), its coordinates or matrix are not finite, it
+            is flattened by a zero scale, or its modifiers change the topology.
+    """
+    reason = refusal(obj)
+    if reason or obj is None:
+        raise UserError(reason)
+    with evaluated(obj, depsgraph) as copy:
+        matrix = as_array(copy.matrix_world)
+        _check_matrix(obj.name, matrix)
+        mesh = copy.to_mesh()
+        try:
+            _check_topology(obj, mesh)
+            local = _floats(mesh, "position", "vector", (len(mesh.vertices), 3))
+            if not np.isfinite(local).all():
+                raise UserError(f"'{obj.name}' has coordinates that are infinite or not numbers.")
+            corner_vertices = _corner_vertices(mesh)
+            triangles = _triangles(mesh, corner_vertices)
+            normals = np.empty((len(corner_vertices), 3), np.float32)
+            mesh.corner_normals.foreach_get("vector", normals.ravel())
+            sizes = np.empty(len(mesh.polygons), np.int32)
+            mesh.polygons.foreach_get("loop_total", sizes)
+        finally:
+            copy.to_mesh_clear()
+    if not len(triangles):
+        raise UserError(f"'{obj.name}' has no faces, so there is nothing to bake.")
+    linear = matrix[:3, :3]
+    if np.linalg.det(linear) < 0:  # a mirror turns the winding round; the normals below stay outward
+        triangles = triangles[:, ::-1]
+    # Rounding of the floats that Blender holds: the local coordinates', grown by the largest scale.
+    # The place of the object adds none, as its translation is the same number for every vertex.
+    spacing = float(np.spacing(np.abs(local).max())) * float(np.linalg.norm(linear, 2))
+    mesh_arrays = TriangleMesh.from_corners(
+        _transform(local, matrix), triangles, corner_vertices, normals @ np.linalg.inv(linear),
+        np.repeat(np.arange(len(sizes), dtype=np.int32), sizes), resolution=spacing)
+    return SceneMesh(mesh_arrays, matrix)
+
+
+def make_applied_copy(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bpy.types.Object:
+    """A new object beside `obj` whose mesh is the evaluated one: same place, collections, materials.
+
+    Raises:
+        UserError: `obj` is no mesh object, or its modifiers leave no faces.
+    """
+    reason = refusal(obj)
+    if reason:
+        raise UserError(reason)
+    with evaluated(obj, depsgraph) as copy:
+        data = bpy.data.meshes.new_from_object(copy, preserve_all_data_layers=True, depsgraph=depsgraph)
+    if not data.polygons:
+        bpy.data.meshes.remove(data)
+        raise UserError(f"The modifiers of '{obj.name}' leave no faces, so there is nothing to bake.")
+    data.name = f"{obj.data.name} (applied)"
+    new = obj.copy()
+    new.name = f"{obj.name} (applied)"
+    preview_off(new)
+    for index, material in enumerate(obj.data.materials):
+        if index < len(data.materials):  # evaluation puts the object's own materials in their place
+            data.materials[index] = material
+    discard(data)
+    new.data = data
+    new.modifiers.clear()
+    for collection in obj.users_collection:
+        collection.objects.link(new)
+    return new
+
+
+def read_occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph,
+                   ) -> list[tuple[Array, NDArray[np.int32]]]:
+    """What blocks the light of `obj` besides itself, in world axes.
+
+    Args:
+        mode: 'SELF' (nothing), 'VISIBLE' (what the viewport shows and a render would), or a
+            collection's name (all its objects, hidden ones too).
+    Returns:
+        One (positions (V, 3) float64, triangles (F, 3) int32) per object and instance.
+    Raises:
+        UserError: there is no such collection.
+    """
+    return [(_transform(local, matrix), triangles[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else triangles)
+            for local, triangles, matrix in _occluders(obj, mode, depsgraph)]
+
+
+def fingerprint(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, occluder_mode: str = SELF) -> str:
+    """What a bake of `obj` depends on, in a short text; compare two with `same_fingerprint`.
+
+    Without other occluders it is the same wherever the object stands, however it is turned and
+    uniformly scaled (none of which changes transfer). With them, what counts is where they stand
+    from the object.
+
+    Raises:
+        UserError: as `read_object`.
+    """
+    reason = refusal(obj)
+    if reason:
+        raise UserError(reason)
+    with evaluated(obj, depsgraph) as copy:
+        matrix = as_array(copy.matrix_world)
+        _check_matrix(obj.name, matrix)
+        mesh = copy.to_mesh()
+        try:
+            _check_topology(obj, mesh)
+            digest = hashlib.blake2b(digest_size=16)
+            local = _floats(mesh, "position", "vector", (len(mesh.vertices), 3))
+            digest.update(local.tobytes())
+            digest.update(_corner_vertices(mesh).tobytes())
+            _hash_shading(mesh, digest)
+        finally:
+            copy.to_mesh_clear()
+    linear = matrix[:3, :3]
+    mirrored = np.linalg.det(linear) < 0
+    _, sizes, axes = np.linalg.svd(linear)
+    stretch = (axes.T * sizes) @ axes  # symmetric part of the polar decomposition: turned by nothing
+    size = float(sizes[0])
+    digest.update(b"mirrored" if mirrored else b"")
+    text = ["%.4f" % (v + 0.0) for v in np.round(stretch[np.triu_indices(3)] / size, 4)]
+    if occluder_mode != SELF:
+        text.append(f"{size:.4g}")
+        rigid = np.eye(4)
+        rigid[:3, :3] = rotation_part(matrix)
+        rigid[:3, 3] = matrix[:3, 3]
+        grain = _SAME * max(float(np.ptp(local, axis=0).max(initial=0.0)) * size, 1e-30)
+        for entry in sorted(_hash_occluder(local, triangles, np.linalg.inv(rigid) @ place, grain)
+                            for local, triangles, place in _occluders(obj, occluder_mode, depsgraph)):
+            digest.update(entry)
+    return digest.hexdigest() + ":" + ",".join(text)
+
+
+def same_fingerprint(first: str, second: str) -> bool:
+    """Whether two fingerprints are of the same shape: the stretch may differ by rounding."""
+    (digest, _, text), (other_digest, _, other_text) = first.partition(":"), second.partition(":")
+    if digest != other_digest:
+        return False
+    try:
+        a, b = (np.array([float(v) for v in t.split(",")]) for t in (text, other_text))
+    except ValueError:
+        return text == other_text
+    return a.shape == b.shape and bool(np.allclose(a, b, rtol=2 * _SAME, atol=2 * _SAME))
+
+
+def _occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph,
+               ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int32], Array]]:
+    """(local positions, triangles, world matrix) of each object and instance that blocks, but `obj`."""
+    if mode == SELF:
+        return
+    if mode == VISIBLE:
+        yield from _instances(depsgraph, None, obj)
+        return
+    collection = bpy.data.collections.get(mode)
+    if collection is None:
+        raise UserError(f"There is no collection named '{mode}' to take occluders from.")
+    members = [o for o in collection.all_objects if o != obj]
+    hidden = [o for o in members if not o.visible_get(view_layer=depsgraph.view_layer)]
+    owners = {o.session_uid for o in collection.all_objects} - {o.session_uid for o in hidden}
+    yield from _instances(depsgraph, owners, obj)
+    if hidden:
+        with revealed(hidden, depsgraph) as (own_depsgraph, _):
+            yield from _instances(own_depsgraph, None, None)
+
+
+def _instances(depsgraph: bpy.types.Depsgraph, owners: set[int] | None, baked: bpy.types.Object | None,
+               ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int32], Array]]:
+    """The solid objects and instances of a depsgraph; of the objects in `owners` only, where given.
+
+    `baked` itself is left out, but instances of it elsewhere are not.
+    """
+    known: dict[tuple[int, int], tuple[NDArray, NDArray] | None] = {}
+    for instance in depsgraph.object_instances:
+        solid = instance.object
+        if solid.type != "MESH" or not instance.show_self:  # curves, texts and balls come as meshes too
+            continue
+        owner = (instance.parent if instance.is_instance else solid).original
+        if owner == baked and not instance.is_instance:
+            continue
+        if owners is None and (owner.hide_render or solid.original.hide_render):
+            continue
+        if owners is not None and owner.session_uid not in owners:
+            continue
+        key = (solid.data.as_pointer(), solid.original.session_uid)
+        if key not in known:
+            known[key] = _solid_arrays(solid)
+        arrays = known[key]
+        matrix = as_array(instance.matrix_world)
+        if arrays is not None and np.isfinite(matrix).all():
+            yield *arrays, matrix
+
+
+def _solid_arrays(solid: bpy.types.Object) -> tuple[NDArray[np.float32], NDArray[np.int32]] | None:
+    """Local positions and triangles of an evaluated object; None where it has no faces."""
+    try:
+        mesh = solid.to_mesh()
+    except RuntimeError:  # Blender's way to say that the object has no geometry, as a second metaball
+        return None
+    if mesh is None:
+        return None
+    try:
+        if not len(mesh.polygons):
+            return None
+        positions = _floats(mesh, "position", "vector", (len(mesh.vertices), 3))
+        triangles = _triangles(mesh, _corner_vertices(mesh))
+        finite = np.isfinite(positions).all(axis=1)
+        return np.nan_to_num(positions), triangles[finite[triangles].all(axis=1)]
+    finally:
+        solid.to_mesh_clear()
+
+
+def _floats(mesh: bpy.types.Mesh, name: str, prop: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """A float attribute of a mesh."""
+    out = np.empty(shape, np.float32)
+    mesh.attributes[name].data.foreach_get(prop, out.ravel())
+    return out
+
+
+def _corner_vertices(mesh: bpy.types.Mesh) -> NDArray[np.int32]:
+    """(C,) vertex of each face corner; the attribute is 300 times faster than mesh.loops."""
+    out = np.empty(len(mesh.loops), np.int32)
+    if len(out):
+        mesh.attributes[".corner_vert"].data.foreach_get("value", out)
+    return out
+
+
+def _triangles(mesh: bpy.types.Mesh, corner_vertices: NDArray[np.int32]) -> NDArray[np.int32]:
+    """(F, 3) vertex indices."""
+    mesh.calc_loop_triangles()
+    corners = np.empty((len(mesh.loop_triangles), 3), np.int32)
+    mesh.loop_triangles.foreach_get("loops", corners.ravel())
+    return corner_vertices[corners]
+
+
+def _check_topology(obj: bpy.types.Object, mesh: bpy.types.Mesh) -> None:
+    """UserError unless the evaluated mesh has the elements of the object's own, in the same order."""
+    own = obj.data
+    same = (len(mesh.vertices) == len(own.vertices) and len(mesh.polygons) == len(own.polygons)
+            and np.array_equal(_corner_vertices(mesh), _corner_vertices(own)))
+    if not same:
+        raise UserError(f"The modifiers of '{obj.name}' change its vertices or faces, so a bake has no place on "
+                        "its mesh; bake an applied copy instead.")
+
+
+def _check_matrix(name: str, matrix: Array) -> None:
+    """UserError for a transform that leaves no shape."""
+    if not np.isfinite(matrix).all():
+        raise UserError(f"'{name}' has a location, rotation or scale that is infinite or not a number.")
+    sizes = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    if sizes[2] <= 1e-9 * sizes[0]:
+        raise UserError(f"'{name}' has a scale of zero, which leaves no shape to bake.")
+
+
+def _transform(local: NDArray[np.float32], matrix: Array) -> Array:
+    """Local points (V, 3) to world axes, in float64."""
+    return local.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def _hash_shading(mesh: bpy.types.Mesh, digest) -> None:
+    """What decides the normals beside the positions; not the normals, whose last bits vary by version."""
+    for name in ("sharp_face", "sharp_edge"):
+        attribute = mesh.attributes.get(name)
+        if attribute is not None:
+            flags = np.empty(len(attribute.data), bool)
+            attribute.data.foreach_get("value", flags)
+            if flags.any():  # an attribute of zeros means the same as none
+                digest.update(name.encode() + flags.tobytes())
+    if mesh.has_custom_normals:
+        normals = np.empty(3 * len(mesh.loops), np.float32)
+        mesh.corner_normals.foreach_get("vector", normals)
+        digest.update(np.round(normals, 4).tobytes())
+
+
+def _hash_occluder(local: NDArray, triangles: NDArray, place: Array, grain: float) -> bytes:
+    """Digest of one occluder's shape and its place (4, 4) seen from the baked object, to `grain` metres."""
+    linear = place[:3, :3]
+    size = np.abs(linear).max()
+    digest = hashlib.blake2b(local.tobytes() + triangles.tobytes(), digest_size=16)
+    digest.update(np.rint(linear / (_SAME * max(size, 1e-30))).astype(np.int64).tobytes())
+    digest.update(f"{size:.4g}".encode())
+    digest.update(np.rint(place[:3, 3] / grain).astype(np.int64).tobytes())
+    return digest.digest()

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Whether a bake still fits its object, known without work while the panel draws.
+
+The dependency graph says which objects changed; half a second after the last change a timer
+compares the fingerprints of those that are baked. In background there are no timers, so `status`
+compares at once.
+"""
+from __future__ import annotations
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..backend.errors import UserError
+from .attributes import has_bake, read_record
+from .read import SELF, fingerprint, same_fingerprint
+
+CURRENT, STALE, NONE = "CURRENT", "STALE", "NONE"
+_DELAY = 0.5  # seconds
+
+_known: dict[int, str] = {}    # session uid of an object -> CURRENT or STALE, as last compared
+_changed: set[int] = set()     # session uids to compare again
+
+
+def status(obj: bpy.types.Object | None) -> str:
+    """'CURRENT', 'STALE' or 'NONE' (no bake). Reads no geometry while a window is open."""
+    if obj is None or not has_bake(obj):
+        return NONE
+    uid = obj.session_uid
+    if uid not in _known or uid in _changed:
+        if bpy.app.background:
+            check(obj)
+        else:
+            _changed.add(uid)
+            _schedule()
+    return _known.get(uid, CURRENT)
+
+
+def check(obj: bpy.types.Object) -> bool:
+    """Compare the object with its bake now: whether the bake still fits. Main thread only."""
+    try:
+        record = read_record(obj)
+        now = fingerprint(obj, bpy.context.evaluated_depsgraph_get(), record.occluders)
+        current = same_fingerprint(now, record.fingerprint)
+    except UserError:  # changed so far that it could not be baked again as it was
+        current = False
+    _known[obj.session_uid] = CURRENT if current else STALE
+    _changed.discard(obj.session_uid)
+    return current
+
+
+def register() -> None:
+    """Start watching."""
+    bpy.app.handlers.depsgraph_update_post.append(_on_update)
+    bpy.app.handlers.load_post.append(_on_load)
+
+
+def unregister() -> None:
+    """Stop watching, and forget."""
+    bpy.app.handlers.depsgraph_update_post.remove(_on_update)
+    bpy.app.handlers.load_post.remove(_on_load)
+    if bpy.app.timers.is_registered(_compare_changed):
+        bpy.app.timers.unregister(_compare_changed)
+    _on_load()
+
+
+@persistent
+def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    """Note what changed; the comparing waits until changes pause."""
+    uids = {update.id.original.session_uid for update in depsgraph.updates
+            if isinstance(update.id, bpy.types.Object) and (update.is_updated_geometry or update.is_updated_transform)}
+    if uids:
+        _changed.update(uids)
+        if not bpy.app.background:
+            _schedule()
+
+
+@persistent
+def _on_load(*_: object) -> None:
+    """Another file: nothing known holds."""
+    _known.clear()
+    _changed.clear()
+
+
+def _schedule() -> None:
+    """(Re)start the wait."""
+    if bpy.app.timers.is_registered(_compare_changed):
+        bpy.app.timers.unregister(_compare_changed)
+    bpy.app.timers.register(_compare_changed, first_interval=_DELAY)
+
+
+def _compare_changed() -> float | None:
+    """Timer: compare each baked object that changed, or whose occluders may have."""
+    changed = set(_changed)
+    _changed.clear()
+    waiting = set()
+    for obj in bpy.context.scene.objects:
+        if not has_bake(obj):
+            continue
+        if obj.mode == "EDIT":  # its mesh is still the one from before
+            if obj.session_uid in changed:
+                waiting.add(obj.session_uid)
+            continue
+        if obj.session_uid in changed or _has_occluders(obj):
+            check(obj)
+    _changed.update(waiting)
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                area.tag_redraw()
+    return None
+
+
+def _has_occluders(obj: bpy.types.Object) -> bool:
+    """Whether the bake depends on other objects too."""
+    try:
+        return read_record(obj).occluders != SELF
+    except UserError:
+        return False

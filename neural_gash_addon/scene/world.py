@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The light of a scene as SH coefficients: its World and its sun lamps."""
+from __future__ import annotations
+
+import math
+
+import bpy
+import numpy as np
+from mathutils import Euler
+from numpy.typing import NDArray
+
+from ..backend import light as sh_light
+from ..backend import spherical_harmonics as sh
+from ..backend.errors import UserError
+
+Array = NDArray[np.float64]
+
+
+def world_light(scene: bpy.types.Scene, order: int) -> Array:
+    """Light (K, 3) from the World and the visible sun lamps of a scene, in world axes.
+
+    The World is an equirectangular environment texture with its mapping's rotation and the
+    background's strength, or a plain colour; without a World there is none of it.
+
+    Raises:
+        UserError: the World is made of something else, or its image cannot be read.
+    """
+    total = _background(scene.world, order)
+    for direction, irradiance in _suns(scene):
+        total += sh_light.sun(direction, irradiance, order)
+    return total
+
+
+def rotated_light(light: NDArray, rotation: float, strength: float = 1.0) -> Array:
+    """The light (K, 3) turned about +Z by `rotation` radians, counter-clockwise from above, and scaled."""
+    cosine, sine = math.cos(rotation), math.sin(rotation)
+    turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    return strength * sh.rotate(light, turn)
+
+
+def _background(world: bpy.types.World | None, order: int) -> Array:
+    """Light (K, 3) of a World."""
+    if world is None:
+        return sh_light.constant(np.zeros(3), order)
+    if not (bpy.app.version >= (5, 0, 0) or world.use_nodes) or world.node_tree is None:
+        return sh_light.constant(np.array(world.color), order)
+    output = next((o for o in map(world.node_tree.get_output_node, ("ALL", "CYCLES", "EEVEE")) if o), None)
+    node = _source(output.inputs["Surface"]) if output else None
+    if node is None:
+        return sh_light.constant(np.zeros(3), order)
+    if node.type != "BACKGROUND":
+        raise UserError(f"The World '{world.name}' ends in a '{node.bl_label}' node; "
+                        "a single Background node can be read as light.")
+    if node.inputs["Strength"].is_linked:
+        raise UserError(f"The Background strength of the World '{world.name}' comes from other nodes; "
+                        "set it to a number to read it as light.")
+    strength = node.inputs["Strength"].default_value
+    colour = _source(node.inputs["Color"])
+    if colour is None:
+        return sh_light.constant(strength * np.array(node.inputs["Color"].default_value[:3]), order)
+    if colour.type == "RGB":
+        return sh_light.constant(strength * np.array(colour.outputs[0].default_value[:3]), order)
+    if colour.type != "TEX_ENVIRONMENT":
+        raise UserError(f"The colour of the World '{world.name}' comes from a '{colour.bl_label}' node; "
+                        "an Environment Texture or a plain colour can be read as light.")
+    if colour.projection != "EQUIRECTANGULAR":
+        raise UserError(f"The Environment Texture of the World '{world.name}' is a mirror ball; "
+                        "only equirectangular images can be read as light.")
+    rotation = _mapping(world.name, colour)
+    image = sh_light.project_equirect(_linear_pixels(world.name, colour.image), order)
+    return strength * sh.rotate(image, rotation)
+
+
+def _source(socket: bpy.types.NodeSocket) -> bpy.types.Node | None:
+    """The node that feeds an input, through reroutes and muted nodes' passes; None where nothing does."""
+    while socket.is_linked:
+        link = socket.links[0]
+        node = link.from_node
+        if link.is_muted:
+            return None
+        if node.type == "REROUTE":
+            socket = node.inputs[0]
+        elif node.mute:
+            passes = [p.from_socket for p in node.internal_links if p.to_socket == link.from_socket]
+            if not passes:
+                return None
+            socket = passes[0]
+        else:
+            return node
+    return None
+
+
+def _mapping(world: str, texture: bpy.types.Node) -> Array:
+    """Rotation (3, 3) that takes the image's light to the world's: inverse of the lookup's.
+
+    Blender looks the image up at A d for a direction d, with A the mapping's rotation (inverted for
+    the type Texture).
+    """
+    node = _source(texture.inputs["Vector"])
+    if node is None or _is_direction(node, texture.inputs["Vector"]):
+        return np.eye(3)
+    if node.type != "MAPPING" or not _is_direction(_source(node.inputs["Vector"]), node.inputs["Vector"]):
+        raise UserError(f"The Environment Texture of the World '{world}' is not mapped by Generated coordinates "
+                        "through at most a Mapping node, so its light cannot be read.")
+    if any(node.inputs[name].is_linked for name in ("Location", "Rotation", "Scale") if name in node.inputs):
+        raise UserError(f"The Mapping of the World '{world}' comes from other nodes; "
+                        "set its rotation to numbers to read it as light.")
+    scale = np.array(node.inputs["Scale"].default_value)
+    uneven = np.ptp(scale) > 1e-6 * np.abs(scale).max() or scale[0] <= 0
+    moved = node.vector_type in ("POINT", "TEXTURE") and any(node.inputs["Location"].default_value)
+    if uneven or moved:
+        raise UserError(f"The Mapping of the World '{world}' moves or unevenly scales its image; "
+                        "only its rotation can be read as light.")
+    matrix = np.array(Euler(node.inputs["Rotation"].default_value).to_matrix(), dtype=np.float64)
+    lookup = matrix.T if node.vector_type == "TEXTURE" else matrix
+    left, _, right = np.linalg.svd(lookup.T)  # float32 rounding off
+    return left @ right
+
+
+def _is_direction(node: bpy.types.Node | None, socket: bpy.types.NodeSocket) -> bool:
+    """Whether `node` feeds `socket` the direction that is looked at."""
+    while node is not None and socket.links[0].from_node != node:  # past reroutes
+        socket = socket.links[0].from_node.inputs[0]
+    return node is not None and node.type == "TEX_COORD" and socket.links[0].from_socket.name == "Generated"
+
+
+def _linear_pixels(world: str, image: bpy.types.Image | None) -> NDArray[np.float32]:
+    """(H, W, C) scene-linear pixels, row 0 at the bottom."""
+    if image is None:
+        raise UserError(f"The Environment Texture of the World '{world}' has no image.")
+    if image.source not in ("FILE", "GENERATED"):
+        raise UserError(f"The image '{image.name}' of the World '{world}' is a {image.source.lower()}; "
+                        "only single images can be read as light.")
+    width, height = image.size  # loads the file where it is not yet
+    if not image.pixels or not width or not height:
+        raise UserError(f"The image '{image.name}' of the World '{world}' cannot be loaded from "
+                        f"'{bpy.path.abspath(image.filepath)}'.")
+    pixels = np.empty((height, width, image.channels), np.float32)
+    image.pixels.foreach_get(pixels.ravel())
+    if image.channels < 3:  # grey, with or without alpha
+        pixels = np.repeat(pixels[..., :1], 3, axis=2)
+    space = image.colorspace_settings
+    if image.is_float or space.is_data or space.name.startswith("Linear"):
+        return pixels  # float images come in scene-linear, whatever they were stored in
+    if space.name != "sRGB":
+        raise UserError(f"The image '{image.name}' of the World '{world}' is in the colour space '{space.name}'; "
+                        "sRGB, linear and float images can be read as light.")
+    return np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4)
+
+
+def _suns(scene: bpy.types.Scene) -> list[tuple[Array, Array]]:
+    """(direction to it (3,), irradiance (3,) W/m^2 on a facing plane) of each visible sun lamp."""
+    layer = bpy.context.view_layer if bpy.context.scene == scene else scene.view_layers[0]
+    layer.update()
+    suns = []
+    for instance in layer.depsgraph.object_instances:
+        lamp = instance.object
+        if lamp.type != "LIGHT" or lamp.data.type != "SUN" or lamp.original.hide_render or not instance.show_self:
+            continue
+        direction = np.array(instance.matrix_world, dtype=np.float64)[:3, 2]
+        length = np.linalg.norm(direction)
+        if np.isfinite(length) and length > 0:
+            suns.append((direction / length, _irradiance(lamp.data)))
+    return suns
+
+
+def _irradiance(sun: bpy.types.SunLight) -> Array:
+    """Irradiance (3,) of a sun lamp on a plane that faces it; its nodes, if any, are not read."""
+    irradiance = np.array(sun.color, dtype=np.float64) * sun.energy
+    irradiance *= 2.0 ** getattr(sun, "exposure", 0.0)     # from 4.5 on
+    if getattr(sun, "use_temperature", False):             # from 4.5 on
+        irradiance *= np.array(sun.temperature_color, dtype=np.float64)
+    if not getattr(sun, "normalize", True):                # then the energy is a radiance
+        irradiance *= math.pi * math.sin(sun.angle / 2) ** 2
+    return irradiance
