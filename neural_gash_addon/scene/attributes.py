@@ -46,7 +46,8 @@ def write_transfer(obj: bpy.types.Object, mesh: TriangleMesh, transfer: Transfer
     """
     data = obj.data
     if obj.mode == "EDIT":
-        raise UserError(f"'{obj.name}' is in Edit Mode, which would discard the bake; leave Edit Mode and bake again.")
+        raise UserError(f"'{obj.name}' is in Edit Mode, which would discard the bake; "
+                        "leave Edit Mode and bake again.")
     if len(mesh.elements) != len(data.vertices if mesh.domain == POINT else data.loops):
         raise UserError(f"'{obj.name}' was changed while it was being baked; bake again.")
     count = attribute_count(transfer.record.order)

@@ -15,7 +15,7 @@ def as_array(matrix) -> Array:
 
 
 def rotation_part(matrix: Array) -> Array:
-    """Nearest rotation (3, 3) to a world matrix (4, 4), by polar decomposition; a mirror's is that of -matrix.
+    """Nearest rotation (3, 3) to a world matrix (4, 4), by polar decomposition; a mirror's is -matrix's.
 
     If an object is only turned by Q between two times, the rotation parts satisfy
     R_now = Q R_then, also under shear, uneven scale and mirrors.

@@ -192,9 +192,9 @@ def _check_attributes(original: bpy.types.Material | None, preview: bpy.types.Ma
     reads = _mesh_reads(_upstream(output.inputs["Surface"]))
     if original is not None and len(reads) > EEVEE_ATTRIBUTES:
         bake = attribute_count(order)
-        raise UserError(f"The colour of the material '{original.name}' reads {len(reads) - bake} attributes of the "
-                        f"mesh; with the {bake} of an order-{order} bake that is more than the {EEVEE_ATTRIBUTES} "
-                        "that EEVEE draws, so simplify it or bake at a lower order.")
+        raise UserError(f"The colour of the material '{original.name}' reads {len(reads) - bake} attributes "
+                        f"of the mesh; with the {bake} of an order-{order} bake that is more than the "
+                        f"{EEVEE_ATTRIBUTES} that EEVEE draws, so simplify it or bake at a lower order.")
 
 
 def _mesh_reads(nodes: list[bpy.types.Node]) -> set[tuple[str, str]]:

@@ -88,15 +88,14 @@ def read_object(obj: bpy.types.Object | None, depsgraph: bpy.types.Depsgraph) ->
     if not len(triangles):
         raise UserError(f"'{obj.name}' has no faces, so there is nothing to bake.")
     linear = matrix[:3, :3]
-    if np.linalg.det(linear) < 0:  # a mirror turns the winding round; the normals below stay outward
-        triangles = triangles[:, ::-1]
     # Rounding of the floats that Blender holds: the local coordinates', grown by the largest scale.
     # The place of the object adds none, as its translation is the same number for every vertex.
     spacing = float(np.spacing(np.abs(local).max())) * float(np.linalg.norm(linear, 2))
-    mesh_arrays = TriangleMesh.from_corners(
-        _transform(local, matrix), triangles, corner_vertices, normals @ np.linalg.inv(linear),
-        np.repeat(np.arange(len(sizes), dtype=np.int32), sizes), resolution=spacing)
-    return SceneMesh(mesh_arrays, matrix)
+    corner_faces = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)
+    world_normals = normals @ np.linalg.inv(linear)  # by the inverse transpose: also outward in a mirror
+    return SceneMesh(TriangleMesh.from_corners(_transform(local, matrix), _outward(triangles, matrix),
+                                               corner_vertices, world_normals, corner_faces,
+                                               resolution=spacing), matrix)
 
 
 def make_applied_copy(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bpy.types.Object:
@@ -140,7 +139,7 @@ def read_occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgr
     Raises:
         UserError: there is no such collection.
     """
-    return [(_transform(local, matrix), triangles[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else triangles)
+    return [(_transform(local, matrix), _outward(triangles, matrix))
             for local, triangles, matrix in _occluders(obj, mode, depsgraph)]
 
 
@@ -296,8 +295,8 @@ def _check_topology(obj: bpy.types.Object, mesh: bpy.types.Mesh) -> None:
     same = (len(mesh.vertices) == len(own.vertices) and len(mesh.polygons) == len(own.polygons)
             and np.array_equal(_corner_vertices(mesh), _corner_vertices(own)))
     if not same:
-        raise UserError(f"The modifiers of '{obj.name}' change its vertices or faces, so a bake has no place on "
-                        "its mesh; bake an applied copy instead.")
+        raise UserError(f"The modifiers of '{obj.name}' change its vertices or faces, so a bake has no place "
+                        "on its mesh; bake an applied copy instead.")
 
 
 def _check_matrix(name: str, matrix: Array) -> None:
@@ -312,6 +311,11 @@ def _check_matrix(name: str, matrix: Array) -> None:
 def _transform(local: NDArray[np.float32], matrix: Array) -> Array:
     """Local points (V, 3) to world axes, in float64."""
     return local.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def _outward(triangles: NDArray[np.int32], matrix: Array) -> NDArray[np.int32]:
+    """The triangles wound as in local coordinates also where the matrix mirrors, which turns them round."""
+    return triangles[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else triangles
 
 
 def _hash_shading(mesh: bpy.types.Mesh, digest) -> None:

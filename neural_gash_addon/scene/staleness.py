@@ -26,12 +26,11 @@ def status(obj: bpy.types.Object | None) -> str:
     if obj is None or not has_bake(obj):
         return NONE
     uid = obj.session_uid
-    if uid not in _known or uid in _changed:
-        if bpy.app.background:
-            check(obj)
-        else:
-            _changed.add(uid)
-            _schedule()
+    if bpy.app.background:
+        check(obj)
+    elif uid not in _known and uid not in _changed:
+        _changed.add(uid)
+        _schedule()
     return _known.get(uid, CURRENT)
 
 
@@ -52,12 +51,16 @@ def register() -> None:
     """Start watching."""
     bpy.app.handlers.depsgraph_update_post.append(_on_update)
     bpy.app.handlers.load_post.append(_on_load)
+    bpy.app.handlers.undo_post.append(_on_undo)
+    bpy.app.handlers.redo_post.append(_on_undo)
 
 
 def unregister() -> None:
     """Stop watching, and forget."""
     bpy.app.handlers.depsgraph_update_post.remove(_on_update)
     bpy.app.handlers.load_post.remove(_on_load)
+    bpy.app.handlers.undo_post.remove(_on_undo)
+    bpy.app.handlers.redo_post.remove(_on_undo)
     if bpy.app.timers.is_registered(_compare_changed):
         bpy.app.timers.unregister(_compare_changed)
     _on_load()
@@ -67,7 +70,8 @@ def unregister() -> None:
 def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Note what changed; the comparing waits until changes pause."""
     uids = {update.id.original.session_uid for update in depsgraph.updates
-            if isinstance(update.id, bpy.types.Object) and (update.is_updated_geometry or update.is_updated_transform)}
+            if isinstance(update.id, bpy.types.Object)
+            and (update.is_updated_geometry or update.is_updated_transform)}
     if uids:
         _changed.update(uids)
         if not bpy.app.background:
@@ -79,6 +83,14 @@ def _on_load(*_: object) -> None:
     """Another file: nothing known holds."""
     _known.clear()
     _changed.clear()
+
+
+@persistent
+def _on_undo(*_: object) -> None:
+    """Shapes and bakes may both have gone back: compare all again."""
+    _changed.update(_known)
+    if not bpy.app.background:
+        _schedule()
 
 
 def _schedule() -> None:

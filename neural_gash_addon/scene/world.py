@@ -100,8 +100,8 @@ def _mapping(world: str, texture: bpy.types.Node) -> Array:
     if node is None or _is_direction(node, texture.inputs["Vector"]):
         return np.eye(3)
     if node.type != "MAPPING" or not _is_direction(_source(node.inputs["Vector"]), node.inputs["Vector"]):
-        raise UserError(f"The Environment Texture of the World '{world}' is not mapped by Generated coordinates "
-                        "through at most a Mapping node, so its light cannot be read.")
+        raise UserError(f"The Environment Texture of the World '{world}' is not mapped by Generated "
+                        "coordinates through at most a Mapping node, so its light cannot be read.")
     if any(node.inputs[name].is_linked for name in ("Location", "Rotation", "Scale") if name in node.inputs):
         raise UserError(f"The Mapping of the World '{world}' comes from other nodes; "
                         "set its rotation to numbers to read it as light.")
@@ -143,8 +143,8 @@ def _linear_pixels(world: str, image: bpy.types.Image | None) -> NDArray[np.floa
     if image.is_float or space.is_data or space.name.startswith("Linear"):
         return pixels  # float images come in scene-linear, whatever they were stored in
     if space.name != "sRGB":
-        raise UserError(f"The image '{image.name}' of the World '{world}' is in the colour space '{space.name}'; "
-                        "sRGB, linear and float images can be read as light.")
+        raise UserError(f"The image '{image.name}' of the World '{world}' is in the colour space "
+                        f"'{space.name}'; sRGB, linear and float images can be read as light.")
     return np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4)
 
 
@@ -155,7 +155,9 @@ def _suns(scene: bpy.types.Scene) -> list[tuple[Array, Array]]:
     suns = []
     for instance in layer.depsgraph.object_instances:
         lamp = instance.object
-        if lamp.type != "LIGHT" or lamp.data.type != "SUN" or lamp.original.hide_render or not instance.show_self:
+        if lamp.type != "LIGHT" or lamp.data.type != "SUN":
+            continue
+        if lamp.original.hide_render or not instance.show_self:
             continue
         direction = np.array(instance.matrix_world, dtype=np.float64)[:3, 2]
         length = np.linalg.norm(direction)
