@@ -230,8 +230,8 @@ def _remove_slot(obj: bpy.types.Object) -> None:
     data = obj.data
     before = np.empty(len(data.polygons), np.int32)
     data.polygons.foreach_get("material_index", before)
-    data.materials.pop(index=0)
-    if before.any():  # faces may name slots that do not exist; popping one renumbers them
+    data.materials.clear()  # pop() would leave the object its slot
+    if before.any():  # faces may name slots that do not exist; clearing renumbers them
         data.polygons.foreach_set("material_index", before)
 
 

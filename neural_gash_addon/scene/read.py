@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..backend.errors import UserError
 from ..backend.geometry import TriangleMesh
-from .attributes import discard
+from .attributes import RECORD, discard
 from .evaluation import evaluated, revealed
 from .frames import Array, as_array, bake_frame, rotation_part
 from .preview import preview_off
@@ -21,6 +21,7 @@ SELF, VISIBLE = "SELF", "VISIBLE"
 # Stretch and places are compared to this part of their size: far above float32 noise of a turned
 # matrix, far below what changes a shadow.
 _SAME = 1e-4
+_FARTHEST = 1e18  # metres; beyond, squares of coordinates leave float32
 
 __all__ = ["SELF", "VISIBLE", "SceneMesh", "bake_frame", "fingerprint", "make_applied_copy", "read_object",
            "read_occluders", "refusal", "same_fingerprint"]
@@ -74,9 +75,8 @@ def read_object(obj: bpy.types.Object | None, depsgraph: bpy.types.Depsgraph) ->
         mesh = copy.to_mesh()
         try:
             _check_topology(obj, mesh)
-            local = _floats(mesh, "position", "vector", (len(mesh.vertices), 3))
-            if not np.isfinite(local).all():
-                raise UserError(f"'{obj.name}' has coordinates that are infinite or not numbers.")
+            local = _positions(mesh)
+            _check_coordinates(obj.name, local, matrix)
             corner_vertices = _corner_vertices(mesh)
             triangles = _triangles(mesh, corner_vertices)
             normals = np.empty((len(corner_vertices), 3), np.float32)
@@ -119,7 +119,9 @@ def make_applied_copy(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> 
     for index, material in enumerate(obj.data.materials):
         if index < len(data.materials):  # evaluation puts the object's own materials in their place
             data.materials[index] = material
-    discard(data)
+    if RECORD in obj.data:  # a new mesh takes the attributes of an earlier bake along, but not its record
+        data[RECORD] = obj.data[RECORD]
+        discard(data)
     new.data = data
     new.modifiers.clear()
     for collection in obj.users_collection:
@@ -163,7 +165,8 @@ def fingerprint(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, occluder_
         try:
             _check_topology(obj, mesh)
             digest = hashlib.blake2b(digest_size=16)
-            local = _floats(mesh, "position", "vector", (len(mesh.vertices), 3))
+            local = _positions(mesh)
+            _check_coordinates(obj.name, local, matrix)
             digest.update(local.tobytes())
             digest.update(_corner_vertices(mesh).tobytes())
             _hash_shading(mesh, digest)
@@ -258,7 +261,7 @@ def _solid_arrays(solid: bpy.types.Object) -> tuple[NDArray[np.float32], NDArray
     try:
         if not len(mesh.polygons):
             return None
-        positions = _floats(mesh, "position", "vector", (len(mesh.vertices), 3))
+        positions = _positions(mesh)
         triangles = _triangles(mesh, _corner_vertices(mesh))
         finite = np.isfinite(positions).all(axis=1)
         return np.nan_to_num(positions), triangles[finite[triangles].all(axis=1)]
@@ -266,10 +269,10 @@ def _solid_arrays(solid: bpy.types.Object) -> tuple[NDArray[np.float32], NDArray
         solid.to_mesh_clear()
 
 
-def _floats(mesh: bpy.types.Mesh, name: str, prop: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """A float attribute of a mesh."""
-    out = np.empty(shape, np.float32)
-    mesh.attributes[name].data.foreach_get(prop, out.ravel())
+def _positions(mesh: bpy.types.Mesh) -> NDArray[np.float32]:
+    """(V, 3) local coordinates."""
+    out = np.empty((len(mesh.vertices), 3), np.float32)
+    mesh.attributes["position"].data.foreach_get("vector", out.ravel())
     return out
 
 
@@ -297,6 +300,13 @@ def _check_topology(obj: bpy.types.Object, mesh: bpy.types.Mesh) -> None:
     if not same:
         raise UserError(f"The modifiers of '{obj.name}' change its vertices or faces, so a bake has no place "
                         "on its mesh; bake an applied copy instead.")
+
+
+def _check_coordinates(name: str, local: NDArray[np.float32], matrix: Array) -> None:
+    """UserError for coordinates that nothing can be computed from."""
+    largest = float(np.abs(local).max(initial=0.0)) * float(np.linalg.norm(matrix[:3, :3], 2))
+    if not largest < _FARTHEST:  # also where it is not a number
+        raise UserError(f"'{name}' has coordinates that are infinite, too large or not numbers.")
 
 
 def _check_matrix(name: str, matrix: Array) -> None:
