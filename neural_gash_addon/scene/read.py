@@ -185,9 +185,14 @@ def fingerprint(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, occluder_
         rigid[:3, :3] = rotation_part(matrix)
         rigid[:3, 3] = matrix[:3, 3]
         grain = _SAME * max(float(np.ptp(local, axis=0).max(initial=0.0)) * size, 1e-30)
-        for entry in sorted(_hash_occluder(local, triangles, np.linalg.inv(rigid) @ place, grain)
-                            for local, triangles, place in _occluders(obj, occluder_mode, depsgraph)):
-            digest.update(entry)
+        seen = np.linalg.inv(rigid)
+        shapes: dict[int, tuple[NDArray, bytes]] = {}  # instances share arrays; held, so that ids stay theirs
+        entries = []
+        for local, triangles, place in _occluders(obj, occluder_mode, depsgraph):
+            if id(local) not in shapes:
+                shapes[id(local)] = local, hashlib.blake2b(local.tobytes() + triangles.tobytes()).digest()
+            entries.append(shapes[id(local)][1] + _place(seen @ place, grain))
+        digest.update(b"".join(sorted(entries)))
     return digest.hexdigest() + ":" + ",".join(text)
 
 
@@ -343,12 +348,9 @@ def _hash_shading(mesh: bpy.types.Mesh, digest) -> None:
         digest.update(np.round(normals, 4).tobytes())
 
 
-def _hash_occluder(local: NDArray, triangles: NDArray, place: Array, grain: float) -> bytes:
-    """Digest of one occluder's shape and its place (4, 4) seen from the baked object, to `grain` metres."""
-    linear = place[:3, :3]
-    size = np.abs(linear).max()
-    digest = hashlib.blake2b(local.tobytes() + triangles.tobytes(), digest_size=16)
-    digest.update(np.rint(linear / (_SAME * max(size, 1e-30))).astype(np.int64).tobytes())
-    digest.update(f"{size:.4g}".encode())
-    digest.update(np.rint(place[:3, 3] / grain).astype(np.int64).tobytes())
-    return digest.digest()
+def _place(matrix: Array, grain: float) -> bytes:
+    """Where an occluder stands, seen from the baked object, rounded; its translation to `grain` metres."""
+    linear = matrix[:3, :3]
+    size = max(float(np.abs(linear).max()), 1e-30)
+    rounded = np.concatenate([np.rint(linear / (_SAME * size)).ravel(), np.rint(matrix[:3, 3] / grain)])
+    return f"{size:.4g}".encode() + (rounded + 0.0).tobytes()

@@ -19,6 +19,7 @@ _DELAY = 0.5  # seconds
 
 _known: dict[int, str] = {}    # session uid of an object -> CURRENT or STALE, as last compared
 _changed: set[int] = set()     # session uids to compare again
+_comparing = False             # the timer is at work; changes seen now are its own
 
 
 def status(obj: bpy.types.Object | None) -> str:
@@ -74,7 +75,7 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
             and (update.is_updated_geometry or update.is_updated_transform)}
     if uids:
         _changed.update(uids)
-        if not bpy.app.background:
+        if not (bpy.app.background or _comparing):
             _schedule()
 
 
@@ -100,26 +101,31 @@ def _schedule() -> None:
     bpy.app.timers.register(_compare_changed, first_interval=_DELAY)
 
 
-def _compare_changed() -> float | None:
+def _compare_changed() -> None:
     """Timer: compare each baked object that changed, or whose occluders may have."""
-    changed = set(_changed)
-    _changed.clear()
-    waiting = set()
-    for obj in bpy.context.scene.objects:
-        if not has_bake(obj):
-            continue
-        if obj.mode == "EDIT":  # its mesh is still the one from before
-            if obj.session_uid in changed:
-                waiting.add(obj.session_uid)
-            continue
-        if obj.session_uid in changed or _has_occluders(obj):
-            check(obj)
-    _changed.update(waiting)
+    global _comparing
+    layer = bpy.context.view_layer
+    _comparing = True
+    try:
+        layer.update()
+        changed = set(_changed)
+        waiting = set()
+        for obj in bpy.context.scene.objects:
+            if not has_bake(obj):
+                continue
+            if obj.mode == "EDIT":  # its mesh is still the one from before
+                waiting |= changed & {obj.session_uid}
+            elif obj.session_uid in changed or _has_occluders(obj):
+                check(obj)
+        layer.update()  # reading a hidden object tags it as changed; heeding that would never end
+        _changed.clear()
+        _changed.update(waiting)
+    finally:
+        _comparing = False
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
                 area.tag_redraw()
-    return None
 
 
 def _has_occluders(obj: bpy.types.Object) -> bool:

@@ -155,7 +155,8 @@ def test_fingerprint_ignores_place_turn_and_even_scale(make):
     assert read.same_fingerprint(_print(obj, make), first)
 
 
-@pytest.mark.parametrize("change", ["scale", "mirror", "shape", "shading", "sharp edge", "topology", "modifier"])
+@pytest.mark.parametrize("change", ["scale", "mirror", "shape", "shading", "sharp edge", "topology",
+                                    "modifier"])
 def test_fingerprint_notices(make, change):
     obj = make.cube(smooth=True)
     first = _print(obj, make)

@@ -154,7 +154,8 @@ def test_duplicate_of_a_previewed_object(make):
     preview.update_light(obj, light)
     mine, theirs = obj.material_slots[0].material, twin.material_slots[0].material
     assert mine != theirs
-    assert tuple(_group_node(mine).inputs["L1"].default_value) != tuple(_group_node(theirs).inputs["L1"].default_value)
+    lights = [tuple(_group_node(m).inputs["L1"].default_value) for m in (mine, theirs)]
+    assert lights[0] != lights[1]
     preview.preview_off(obj)
     preview.preview_off(twin)
     assert twin.material_slots[0].material == obj.material_slots[0].material == bpy.data.materials["Paint"]

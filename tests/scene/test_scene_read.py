@@ -154,16 +154,20 @@ def test_applied_copy_of_a_previewed_bake_is_clean(make):
 
 def test_modifier_that_only_reorders_is_refused(make):
     obj = make.mesh([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], [(0, 1, 2), (0, 2, 3)])
-    obj.modifiers.new("Order", "BUILD").frame_duration = 1
-    bpy.context.scene.frame_set(100)
-    read.read_object(obj, make.depsgraph())
-    obj.modifiers[0].use_reverse = False
-    obj.modifiers[0].use_random_order = True
-    obj.modifiers[0].seed = 3
-    mesh = obj.evaluated_get(make.depsgraph()).data
-    if [tuple(p.vertices) for p in mesh.polygons] == [tuple(p.vertices) for p in obj.data.polygons]:
-        pytest.skip("this Blender's Build modifier keeps the order")
-    with pytest.raises(UserError):
+    group = bpy.data.node_groups.new("Sort", "GeometryNodeTree")
+    group.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
+    group.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    start, end = group.nodes.new("NodeGroupInput"), group.nodes.new("NodeGroupOutput")
+    sort, index = group.nodes.new("GeometryNodeSortElements"), group.nodes.new("GeometryNodeInputIndex")
+    backwards = group.nodes.new("ShaderNodeMath")
+    backwards.operation, backwards.inputs[1].default_value = "MULTIPLY", -1
+    sort.domain = "FACE"
+    group.links.new(start.outputs[0], sort.inputs["Geometry"])
+    group.links.new(index.outputs[0], backwards.inputs[0])
+    group.links.new(backwards.outputs[0], sort.inputs["Sort Weight"])
+    group.links.new(sort.outputs[0], end.inputs[0])
+    obj.modifiers.new("Sort", "NODES").node_group = group
+    with pytest.raises(UserError, match="applied copy"):
         read.read_object(obj, make.depsgraph())
 
 
@@ -261,8 +265,8 @@ def _edit_mode(make):
     return obj
 
 
-@pytest.mark.parametrize("build", [_no_object, _empty, _no_faces, _not_finite, _infinite, _too_large, _no_scale,
-                                   _bad_place, _edit_mode])
+@pytest.mark.parametrize("build", [_no_object, _empty, _no_faces, _not_finite, _infinite, _too_large,
+                                   _no_scale, _bad_place, _edit_mode])
 def test_bad_input_gets_one_sentence(make, build):
     obj = build(make)
     with pytest.raises(UserError) as error:

@@ -67,6 +67,28 @@ def test_after_loading_another_file(make, tmp_path):
     assert _status(bpy.data.objects["Cube"]) == "STALE"
 
 
+def test_comparing_and_lighting_change_nothing_that_would_compare_again(make):
+    import numpy as np
+
+    from neural_gash_addon.scene import preview
+    obj = make.cube()
+    obj.data.materials.append(None)
+    make.bake(obj)
+    preview.preview_on(obj)
+    bpy.context.view_layer.update()
+    staleness._changed.clear()
+    preview.update_light(obj, np.ones((9, 3)))
+    bpy.context.view_layer.update()
+    assert obj.session_uid not in staleness._changed
+    obj.hide_set(True)  # so that comparing makes a scene of its own
+    bpy.context.view_layer.update()
+    staleness._changed.clear()
+    staleness._changed.add(obj.session_uid)
+    staleness._compare_changed()
+    bpy.context.view_layer.update()
+    assert obj.session_uid not in staleness._changed
+
+
 def test_changes_are_noted_and_compared_when_the_timer_comes(make):
     obj, far = make.cube(), make.cube("Far")
     make.bake(obj)
