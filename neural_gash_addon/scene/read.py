@@ -92,9 +92,9 @@ def read_object(obj: bpy.types.Object | None, depsgraph: bpy.types.Depsgraph) ->
     # The place of the object adds none, as its translation is the same number for every vertex.
     spacing = float(np.spacing(np.abs(local).max())) * float(np.linalg.norm(linear, 2))
     corner_faces = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)
-    world_normals = normals @ np.linalg.inv(linear)  # by the inverse transpose: also outward in a mirror
+    normals = normals @ np.linalg.inv(linear).astype(np.float32)  # inverse transpose: outward in mirrors, too
     return SceneMesh(TriangleMesh.from_corners(_transform(local, matrix), _outward(triangles, matrix),
-                                               corner_vertices, world_normals, corner_faces,
+                                               corner_vertices, normals, corner_faces,
                                                resolution=spacing), matrix)
 
 

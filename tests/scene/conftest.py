@@ -94,11 +94,16 @@ def make() -> type[Maker]:
 
 @pytest.fixture
 def render(tmp_path):
-    """render(width, height) -> (H, W, 4) float32 as Cycles computes it on the CPU, row 0 at the bottom."""
-    def shoot(width, height, samples=1):
+    """render(width, height) -> (H, W, 4) float32 as Cycles (or EEVEE) shows it, row 0 at the bottom."""
+    def shoot(width, height, samples=1, eevee=False):
         import bpy
         scene = bpy.context.scene
-        scene.render.engine = "CYCLES"
+        if eevee:
+            scene.render.engine = "BLENDER_EEVEE" if bpy.app.version >= (5, 0, 0) else "BLENDER_EEVEE_NEXT"
+            scene.eevee.taa_render_samples = samples
+            scene.render.filter_size = 0.01
+        else:
+            scene.render.engine = "CYCLES"
         scene.cycles.device = "CPU"
         scene.cycles.samples = samples
         scene.cycles.use_adaptive_sampling = False

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The shading group equals the NumPy evaluation."""
+from ctypes.util import find_library
+
 import numpy as np
 import pytest
 
@@ -56,6 +58,21 @@ def test_cycles_equals_numpy(make, render, camera, order, smooth):
     assert np.quantile(difference, 0.97) < 1e-4 * max(1.0, np.abs(expected).max())
     if smooth:
         assert difference.max() < 5e-4 * np.abs(expected).max()
+
+
+@pytest.mark.skipif(not find_library("EGL"), reason="EEVEE needs a graphics driver")
+def test_eevee_equals_numpy_to_half_precision(make, render, camera):
+    obj = make.grid(1)
+    make.bake(obj, order=5)  # seven attributes
+    light = np.random.default_rng(1).normal(0, 1, (25, 3))
+    preview.preview_on(obj)
+    preview.update_light(obj, light)
+    camera((0, 0, 5), (0, 0, -1), width=2)
+    picture = render(64, 64, eevee=True)[..., :3]
+    values, _ = attributes.read_transfer(obj)
+    expected = np.maximum(_interpolated(obj, radiance(values, light, 0.8), 64), 0)  # it cannot show less
+    assert expected.max() > 1
+    np.testing.assert_allclose(picture, expected, atol=2e-3 * expected.max())
 
 
 def test_group_is_small_and_shared(make):
