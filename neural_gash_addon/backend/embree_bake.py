@@ -19,6 +19,7 @@ from .transfer import Transfer
 BLOCK = 1 << 16         # points accumulated at a time, so that memory does not grow with the mesh
 FIRST_RAYS = 32         # of an adaptive point; it has twice that before it may stop
 RATE = 1.5              # the estimator's variance falls as rays**-RATE (scrambled nets, measured)
+KEPT = 0.7              # squared error left after a doubling, as a part of the squared change (calibrated)
 POOL = 9                # neighbours along the Z-order curve whose error estimates are averaged
 REPLICATES = 1024       # points baked twice to measure the error, or a 32nd of them if that is more
 _MAX_REPLICATES = 8192
@@ -79,7 +80,7 @@ def _pilot(mesh: TriangleMesh, estimator: BlockedEstimator, lit: NDArray, order:
     sums = np.zeros((len(sample), sh.coefficient_count(order)))
     for _ in estimator.trace(pool, threads, sample, 0, FIRST_RAYS, sums):
         yield 0.0
-    blocked = sh.rotate_each(sums / FIRST_RAYS, estimator.frames(sample))
+    blocked = estimator.to_world(sample, estimator.means(sample, sums, 0, FIRST_RAYS))
     transfer = sh.cosine_lobe(mesh.normals[sample], order) - blocked
     return float(np.sqrt(np.square(transfer).sum(1).mean())), len(sample) * FIRST_RAYS
 
@@ -93,32 +94,30 @@ def _trace_block(estimator: BlockedEstimator, block: NDArray, order: int, rays: 
     """
     count = len(block)
     sums = np.zeros((count, sh.coefficient_count(order)))
-    taken = np.zeros(count, dtype=np.int32)
     if rays is not None:
         yield from estimator.trace(pool, threads, block, 0, rays, sums)
-        taken[:] = rays
-    else:
-        assert variance is not None
-        squared_error = np.zeros(count)
-        active = np.arange(count)
-        start, stop = 0, FIRST_RAYS
-        left = 1.0
-        while len(active):
-            fresh = np.zeros((len(active), sums.shape[1]))
-            yield from _scaled(estimator.trace(pool, threads, block[active], start, stop, fresh), 1 - left, left / 2)
-            left /= 2
-            if start:
-                change = np.square(fresh / start - sums[active] / start).sum(1) / 4
-                squared_error[active] = _pooled(change)
-            sums[active] += fresh
-            taken[active] = stop
-            if start:
-                active = active[_to_continue(squared_error, taken, variance)[active]]
-            if stop >= MAX_RAYS:
-                break
-            start, stop = stop, 2 * stop
-    sums /= np.maximum(taken, 1)[:, None]
-    return sh.rotate_each(sums, estimator.frames(block)), taken
+        return estimator.to_world(block, estimator.means(block, sums, 0, rays)), np.full(count, rays)
+    assert variance is not None
+    local, squared_error, taken = np.zeros_like(sums), np.zeros(count), np.zeros(count, dtype=np.int32)
+    active = np.arange(count)
+    start, stop, left = 0, FIRST_RAYS, 1.0
+    while len(active):
+        points = block[active]
+        fresh = np.zeros((len(active), sums.shape[1]))
+        yield from _scaled(estimator.trace(pool, threads, points, start, stop, fresh), 1 - left, left / 2)
+        left /= 2
+        sums[active] += fresh
+        now = estimator.means(points, sums[active], 0, stop)
+        if start:
+            squared_error[active] = KEPT * _pooled(np.square(now - local[active]).sum(1))
+        local[active] = now
+        taken[active] = stop
+        if start:
+            active = active[_to_continue(squared_error, taken, variance)[active]]
+        if stop >= MAX_RAYS:
+            break
+        start, stop = stop, 2 * stop
+    return estimator.to_world(block, local), taken
 
 
 def _pooled(values: NDArray) -> NDArray:
@@ -170,7 +169,8 @@ def _measured_error(mesh: TriangleMesh, scene: Occluders, order: int, seed: int,
         sums = np.zeros((len(points), coefficients.shape[1]))
         for share in twin.trace(pool, threads, points, 0, int(rays), sums):
             yield (traced + share * len(points) * rays) / max(1, int(taken.sum()))
-        again = sh.cosine_lobe(mesh.normals[points], order) - sh.rotate_each(sums / rays, twin.frames(points))
+        blocked = twin.to_world(points, twin.means(points, sums, 0, int(rays)))
+        again = sh.cosine_lobe(mesh.normals[points], order) - blocked
         squared += float(np.square(again - coefficients[points]).sum()) / 2
         traced += len(points) * int(rays)
     energy = float(np.square(coefficients[sample], dtype=np.float64).sum())

@@ -21,7 +21,7 @@ from . import spherical_harmonics as sh
 from .geometry import TriangleMesh
 from .raycast import Occluders
 
-SETS = 32
+SETS = 16
 MAX_RAYS = 4096
 RAYS_PER_JOB = 1 << 16  # about 15 ms of one thread: short enough to stop at once, long enough to be efficient
 
@@ -39,6 +39,7 @@ class BlockedEstimator:
         self._normals = mesh.normals
         self._angles = rng.uniform(0, 2 * np.pi, len(mesh.points)).astype(np.float32)
         self._set_of_point = rng.integers(0, SETS, len(mesh.points), dtype=np.uint8)
+        self._excess: dict[tuple[int, int], NDArray] = {}
         self._stop = threading.Event()
 
     def trace(self, pool: ThreadPoolExecutor, threads: int, points: NDArray, start: int, stop: int,
@@ -89,7 +90,7 @@ class BlockedEstimator:
             # (9, 3r): frame (row-major, 9) @ lift = the r directions' world coordinates in a row,
             # so that one matrix product makes the rays of many points in the layout Embree reads
             lift = np.einsum("cd,ja->cajd", np.eye(3), local).reshape(9, -1).astype(np.float32)
-            harmonics = sh.evaluate(local, self._order).astype(np.float32)
+            harmonics = sh.evaluate(local, self._order)
             for first in range(0, len(rows), size):
                 yield rows[first:first + size], (lift, harmonics)
 
@@ -97,16 +98,35 @@ class BlockedEstimator:
         """Worker: (n, K) sums of Y_k over the blocked ones of these directions at these points."""
         if self._stop.is_set():
             return np.zeros((len(points), harmonics.shape[1]))
-        frames = self.frames(points).reshape(-1, 9).astype(np.float32)
+        frames = self._frames(points).reshape(-1, 9).astype(np.float32)
         count = len(harmonics)
         directions = (frames @ lift).reshape(-1, 3)
         origins = np.repeat(self._origins[points], count, axis=0)
         free = self._occluders.blocked(origins, directions)  # 0 blocked, -1 free
-        blocked = np.add(free, 1, dtype=np.float32, casting="unsafe").reshape(-1, count)
-        return (blocked @ harmonics).astype(np.float64)
+        blocked = np.add(free, 1, dtype=np.float64).reshape(-1, count)
+        return blocked @ harmonics
 
-    def frames(self, points: NDArray) -> NDArray[np.float64]:
-        """(n, 3, 3) local-to-world rotations of these points."""
+    def means(self, points: NDArray, sums: NDArray, start: int, stop: int) -> NDArray[np.float64]:
+        """Blocked part (n, K) in the local frame, from sums over directions start..stop.
+
+        What is known of the directions is used: the mean of Y_k over all of them misses the exact
+        unblocked integral by some excess, and a point of which a share b is blocked has had about b
+        of it (a control variate). So a point that is all blocked gets exactly the unshadowed
+        transfer, one that is all free exactly nothing.
+        """
+        if (start, stop) not in self._excess:
+            exact = sh.cosine_lobe(np.array([[0.0, 0.0, 1.0]]), self._order)[0]
+            self._excess[start, stop] = np.stack([exact - sh.evaluate(local[start:stop], self._order).mean(0)
+                                                  for local in self._sets])
+        mean = sums / (stop - start)
+        share = mean[:, :1] / sh.normalisation(0, 0)  # Y_0 is constant, so this counts the blocked rays
+        return mean + share * self._excess[start, stop][self._set_of_point[points]]
+
+    def to_world(self, points: NDArray, local: NDArray) -> NDArray[np.float64]:
+        """Local coefficients (n, K) of these points in the bake frame."""
+        return sh.rotate_each(local, self._frames(points))
+
+    def _frames(self, points: NDArray) -> NDArray[np.float64]:
         return sampling.frames(self._normals[points], self._angles[points].astype(np.float64))
 
 
