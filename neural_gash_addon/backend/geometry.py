@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from .errors import UserError
 
 POINT, CORNER = "POINT", "CORNER"
+NO_FACES = "The mesh has no faces, so there is nothing to bake."
+NOT_FINITE = "The mesh has coordinates that are infinite or not numbers."
 
 # Corner normals of one vertex closer than this are one normal: above float32 noise of averaged
 # normals, below any split that can be seen (0.06 degrees).
@@ -51,9 +53,9 @@ class TriangleMesh:
         triangles = np.ascontiguousarray(triangles, dtype=np.int32)
         corner_vertices = np.asarray(corner_vertices)
         if not len(triangles) or not len(corner_vertices):
-            raise UserError("The mesh has no faces, so there is nothing to bake.")
+            raise UserError(NO_FACES)
         if not np.isfinite(positions).all():
-            raise UserError("The mesh has coordinates that are infinite or not numbers.")
+            raise UserError(NOT_FINITE)
         if resolution is None:
             resolution = float(np.spacing(np.float32(np.abs(positions).max())))
         normals = _unit(corner_normals)
@@ -76,7 +78,9 @@ class TriangleMesh:
         positions = np.asarray(positions, dtype=np.float64)
         triangles = np.asarray(triangles, dtype=np.int32)
         if not len(triangles):
-            raise UserError("The mesh has no faces, so there is nothing to bake.")
+            raise UserError(NO_FACES)
+        if not np.isfinite(positions).all():
+            raise UserError(NOT_FINITE)
         corners = positions[triangles]                                   # (F, 3, 3)
         face_normals = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
         corner_normals = np.repeat(face_normals, 3, axis=0)

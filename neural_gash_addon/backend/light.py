@@ -9,7 +9,7 @@ from . import spherical_harmonics as sh
 
 Array = NDArray[np.float64]
 
-_GAUSS_NODES = 8  # exact to rounding for the smooth theta integrals, even of a one-row image
+_GAUSS_NODES = 16  # exact to rounding for the smooth theta integrals, even of a one-row image
 
 
 def project_equirect(image: NDArray, order: int) -> Array:
