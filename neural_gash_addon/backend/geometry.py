@@ -6,6 +6,7 @@ is a point, and the face corners that share it read the same coefficients.
 """
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,19 +59,20 @@ class TriangleMesh:
             raise UserError(NOT_FINITE)
         if resolution is None:
             resolution = float(np.spacing(np.float32(np.abs(positions).max())))
-        normals = _unit(corner_normals)
         vertex_normals = np.zeros_like(positions)
-        vertex_normals[corner_vertices] = normals  # any one corner's, to compare the others with
-        split = np.abs(normals - vertex_normals[corner_vertices]).max(initial=0.0) > SAME_NORMAL
+        vertex_normals[corner_vertices] = corner_normals  # any one corner's, to compare the others with
+        vertex_normals = _unit(vertex_normals)
+        split = any(np.abs(_unit(corner_normals[s]) - vertex_normals[corner_vertices[s]]).max() > SAME_NORMAL
+                    for s in _blocks(len(corner_vertices)))
         if not split:
             count = len(positions)
             return TriangleMesh(positions, triangles, positions, vertex_normals, np.zeros((count, 3)),
                                 np.arange(count, dtype=np.int32), POINT, resolution)
-        first, elements = _distinct(corner_vertices, normals)
-        point_vertices = corner_vertices[first]
-        insets = _insets(positions, corner_vertices, corner_faces, elements, normals[first], point_vertices)
-        return TriangleMesh(positions, triangles, positions[point_vertices], normals[first], insets,
-                            elements.astype(np.int32), CORNER, resolution)
+        first, elements = _distinct(corner_vertices, corner_normals)
+        point_vertices, normals = corner_vertices[first], _unit(corner_normals[first])
+        insets = _insets(positions, corner_vertices, corner_faces, elements, normals)
+        return TriangleMesh(positions, triangles, positions[point_vertices], normals, insets,
+                            elements, CORNER, resolution)
 
     @staticmethod
     def from_triangles(positions: NDArray, triangles: NDArray, smooth: bool = True) -> TriangleMesh:
@@ -102,34 +104,44 @@ def _unit(vectors: NDArray) -> NDArray[np.float64]:
     return np.divide(v, length, out=np.zeros_like(v), where=good)
 
 
-def _distinct(corner_vertices: NDArray, normals: NDArray) -> tuple[NDArray, NDArray]:
+def _blocks(count: int) -> Iterator[slice]:
+    """Slices of 2**18 that cover range(count): what is computed a block at a time takes little memory."""
+    return (slice(start, start + (1 << 18)) for start in range(0, count, 1 << 18))
+
+
+def _distinct(corner_vertices: NDArray, corner_normals: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """Corners grouped by vertex and (nearly) equal normal: first corner of each group, group of each corner.
 
     Equal is decided on a grid of SAME_NORMAL, so a pair across a cell's border may stay apart:
     that costs a point, never a wrong one.
     """
-    cells = np.rint(normals / SAME_NORMAL).astype(np.int64) + 2000
-    key = ((cells[:, 0] * 4001 + cells[:, 1]) * 4001) + cells[:, 2]
+    key = np.empty(len(corner_vertices), dtype=np.int64)
+    steps = round(1 / SAME_NORMAL)
+    side = 2 * steps + 1
+    for s in _blocks(len(key)):
+        cells = np.rint(_unit(corner_normals[s]) * steps).astype(np.int64) + steps
+        key[s] = (cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]
     order = np.lexsort((key, corner_vertices))
     v, k = corner_vertices[order], key[order]
     starts = np.concatenate([[True], (v[1:] != v[:-1]) | (k[1:] != k[:-1])])
-    elements = np.empty(len(order), dtype=np.int64)
-    elements[order] = np.cumsum(starts) - 1
+    elements = np.empty(len(order), dtype=np.int32)
+    elements[order] = np.cumsum(starts, dtype=np.int32) - 1
     return order[starts], elements
 
 
 def _insets(positions: NDArray, corner_vertices: NDArray, corner_faces: NDArray, elements: NDArray,
-            point_normals: NDArray, point_vertices: NDArray) -> NDArray[np.float64]:
+            point_normals: NDArray) -> NDArray[np.float64]:
     """Tangent directions from each point into the faces it belongs to: (N, 3), length at most 1.
 
     A corner of a flat wall lies in the plane of the next wall too; a ray that starts exactly there
     may pass behind it. A step into the point's own faces settles on which side it is.
     """
-    _, face_index = np.unique(corner_faces, return_inverse=True)
-    size = np.bincount(face_index)
-    centres = np.stack([np.bincount(face_index, positions[corner_vertices, a]) for a in range(3)], 1) / size[:, None]
-    towards = _unit(centres[face_index] - positions[corner_vertices])
-    count = len(point_vertices)
-    mean = np.stack([np.bincount(elements, towards[:, a], count) for a in range(3)], 1)
+    face = np.cumsum(np.concatenate([[0], np.diff(corner_faces) != 0]))
+    size = np.bincount(face)
+    centres = np.stack([np.bincount(face, positions[corner_vertices, a]) for a in range(3)], 1) / size[:, None]
+    mean = np.zeros_like(point_normals)
+    for s in _blocks(len(elements)):
+        towards = _unit(centres[face[s]] - positions[corner_vertices[s]])
+        np.add.at(mean, elements[s], towards)
     mean -= (mean * point_normals).sum(1, keepdims=True) * point_normals
     return _unit(mean)
