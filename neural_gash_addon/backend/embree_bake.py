@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,8 @@ KEPT = 0.7              # squared error left after a doubling, as a part of the 
 POOL = 9                # neighbours along the Z-order curve whose error estimates are averaged
 REPLICATES = 1024       # points baked twice to measure the error, or a 32nd of them if that is more
 _MAX_REPLICATES = 8192
+
+Result = TypeVar("Result")
 
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
@@ -62,7 +65,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
         seconds=time.perf_counter() - began, error_estimate=error, tolerance=tolerance))
 
 
-def _scaled(work: Generator, start: float, share: float) -> Generator:
+def _scaled(work: Generator[float, None, Result], start: float, share: float) -> Generator[float, None, Result]:
     """Run a part of the bake as progress start..start+share of the whole."""
     try:
         while True:

@@ -34,7 +34,7 @@ def project_equirect(image: NDArray, order: int) -> Array:
     rows = np.empty((height, 2 * order - 1, 3))
     band = max(1, (1 << 20) // width)                   # rows at a time, so that a 16k map fits
     for start in range(0, height, band):
-        block = np.nan_to_num(image[start:start + band, :, :3], nan=0.0, posinf=np.finfo(np.float32).max)
+        block = np.nan_to_num(image[start:start + band, :, :3], nan=0.0, posinf=float(np.finfo(np.float32).max))
         block = np.maximum(block, 0.0).astype(np.float64)
         rows[start:start + band] = np.einsum("hwc,wm->hmc", block, longitude, optimize=True)
     out = np.empty((sh.coefficient_count(order), 3))

@@ -8,6 +8,7 @@ Real, orthonormal over the sphere, without the Condon-Shortley phase; flat index
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -58,11 +59,12 @@ def evaluate(directions: NDArray, order: int) -> Array:
     is singular at the poles.
     """
     d = np.asarray(directions, dtype=np.float64)
-    return np.ascontiguousarray(_evaluate_rows(*np.ascontiguousarray(d.T), order).T)
+    return np.ascontiguousarray(_evaluate_rows(np.ascontiguousarray(d.T), order).T)
 
 
-def _evaluate_rows(x: Array, y: Array, z: Array, order: int) -> Array:
-    """`evaluate` from separate coordinates (N,) into contiguous rows (K, N), which NumPy does faster."""
+def _evaluate_rows(coordinates: Sequence[Array] | Array, order: int) -> Array:
+    """`evaluate` from coordinates x, y, z (3, N) into contiguous rows (K, N), which NumPy does faster."""
+    x, y, z = coordinates
     out = np.empty((coefficient_count(order), len(x)))
     cosine, sine = np.ones_like(x), np.zeros_like(x)  # Re and Im of (x + iy)^m
     diagonal = 1.0  # (2m-1)!!, P_mm without its sin^m, which is in (x + iy)^m
@@ -159,7 +161,7 @@ def rotate_each(coefficients: NDArray, rotations: NDArray) -> Array:
         total = np.zeros_like(rows)
         for j, (dx, dy, dz) in enumerate(directions):
             turned = [matrices[3 * i] * dx + matrices[3 * i + 1] * dy + matrices[3 * i + 2] * dz for i in range(3)]
-            values = _evaluate_rows(*turned, order)
+            values = _evaluate_rows(turned, order)
             for band in range((j + 1) // 2, order):  # lobe j takes part where 2l+1 > j
                 s = band_slice(band)
                 total[s] += values[s] * lobes[band][j]
