@@ -14,6 +14,9 @@ Geometry = tuple[NDArray, NDArray]  # positions (V, 3), triangles (F, 3)
 OFFSET = 3e-6
 # ... and relative to the spacing of the coordinates as they came, whose rounding tilts flat faces.
 RESOLUTION_STEPS = 2.0
+# Triangles handed to Embree at a time: its wrapper copies them holding the interpreter's lock, for
+# about 40 ms a piece, and a window must get a turn in between.
+PIECE = 1 << 15
 
 
 class Occluders:
@@ -30,16 +33,18 @@ class Occluders:
 
         parts = [(np.asarray(p, dtype=np.float64), np.asarray(t, dtype=np.int32)) for p, t in geometry]
         parts = [(p, t) for p, t in parts if len(p) and len(t)]
-        used = [p[np.unique(t)] for p, t in parts]
-        low = np.min([u.min(0) for u in used], axis=0)
-        high = np.max([u.max(0) for u in used], axis=0)
+        corners = [p[np.unique(t)] for p, t in parts]  # loose vertices do not stretch the box
+        low = np.min([c.min(0) for c in corners], axis=0)
+        high = np.max([c.max(0) for c in corners], axis=0)
         self.centre = 0.5 * (low + high)
         extent = float(np.max(high - low))
         self.scale = 1.0 / extent if extent > 0 else 1.0
         self.offset = max(OFFSET, RESOLUTION_STEPS * resolution * self.scale)
         self._scene = EmbreeScene(robust=True)  # watertight edges
         for positions, triangles in parts:
-            EmbreeMesh(self._scene, self.normalise(positions), np.ascontiguousarray(triangles))
+            for start in range(0, len(triangles), PIECE):
+                used_here, piece = np.unique(triangles[start:start + PIECE], return_inverse=True)
+                EmbreeMesh(self._scene, self.normalise(positions[used_here]), piece.reshape(-1, 3))
         # the first query commits the scene, which only one thread may do
         self.blocked(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))
 
