@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+# make demo   bake a mesh, light it with an HDRI, render it; pictures go to out/
+# make test   run the tests
+.PHONY: demo test lint package bench clean
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+PY := .venv/bin/python
+
+.venv/ready: requirements.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || \
+	  { echo "Neural GASh is developed with Python 3.11, which was not found; install it or set PYTHON=."; exit 1; }
+	$(PYTHON) -m venv .venv
+	$(PY) -m pip install --disable-pip-version-check -q -r requirements.txt
+	touch $@
+
+demo: .venv/ready
+	$(PY) demo/demo.py
+
+test: .venv/ready
+	$(PY) -m pytest
+
+lint: .venv/ready
+	.venv/bin/ruff check .
+	.venv/bin/mypy
+
+package: .venv/ready
+	$(PY) tools/package.py
+
+bench: .venv/ready
+	$(PY) -m pip install --disable-pip-version-check -q -r benchmarks/requirements.txt
+	$(PY) benchmarks/bench.py
+
+clean:
+	rm -rf .venv build dist out .pytest_cache .mypy_cache .ruff_cache
