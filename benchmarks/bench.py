@@ -8,13 +8,15 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+import ambient
+import equal_error
 import memory
 import throughput
 from table import Table, machine
 
 from neural_gash_addon.backend.estimator import default_threads
 
-PARTS = ("throughput", "memory")
+PARTS = ("throughput", "memory", "error", "job", "ambient")
 
 
 def main() -> int:
@@ -31,6 +33,12 @@ def main() -> int:
         throughput.measure(table, threads, args.quick)
     if "memory" in parts:
         memory.measure(table, args.quick)
+    if "error" in parts:
+        equal_error.measure(table, threads, args.quick)
+    if "job" in parts:
+        equal_error.measure_whole_job(table, threads, args.quick)
+    if "ambient" in parts:
+        ambient.measure(table, threads)
     missed = table.missed()
     print(f"\n{len(missed)} target(s) missed" + "".join(f"\n- {row}" for row in missed))
     return 1 if missed else 0
