@@ -143,6 +143,7 @@ class Mitsuba:
             return i + 1, random, [a + weight * y for a, y in zip(sums, values, strict=True)]
 
         _, _, sums = dr.while_loop((mi.UInt32(0), random, sums), lambda i, *_: i < steps, step)
+        dr.eval(sums)  # all at once: each block_sum alone would run the loop again
         totals = [dr.block_sum(s, self.LANES) for s in sums]
         dr.eval(totals)
         out = np.stack([t.numpy() for t in totals], 1).astype(np.float64)

@@ -46,15 +46,13 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
         scale = None
         if tolerance is not None and len(lit):
-            scale, traced = yield from _pilot(mesh, estimator, lit, order, pool, threads)
+            scale, traced = yield from _pilot(estimator, lit, order, pool, threads)
         for start in range(0, len(lit), BLOCK):
             block = lit[start:start + BLOCK]
             done, share = start / len(lit), len(block) / len(lit)
             work = _trace_block(estimator, block, order, rays, None if scale is None or tolerance is None
                                 else (tolerance * scale) ** 2, pool, threads)
-            blocked, taken = yield from _scaled(work, 0.95 * done, 0.95 * share)
-            coefficients[block] = sh.cosine_lobe(mesh.normals[block], order) - blocked
-            rays_of_point[block] = taken
+            coefficients[block], rays_of_point[block] = yield from _scaled(work, 0.95 * done, 0.95 * share)
         traced += int(rays_of_point.sum(dtype=np.int64))
         if len(lit):
             work_error = _measured_error(mesh, scene, order, seed, coefficients, rays_of_point, lit, pool, threads)
@@ -76,22 +74,21 @@ def _scaled(work: Generator[float, None, Result], start: float, share: float) ->
         work.close()
 
 
-def _pilot(mesh: TriangleMesh, estimator: BlockedEstimator, lit: NDArray, order: int, pool: ThreadPoolExecutor,
-           threads: int) -> Generator[float, None, tuple[float, int]]:
+def _pilot(estimator: BlockedEstimator, lit: NDArray, order: int, pool: ThreadPoolExecutor, threads: int
+           ) -> Generator[float, None, tuple[float, int]]:
     """RMS of |T| over the mesh from a sample of points: what a relative tolerance is relative to."""
     sample = lit[::max(1, len(lit) // REPLICATES)]
     sums = np.zeros((len(sample), sh.coefficient_count(order)))
     for _ in estimator.trace(pool, threads, sample, 0, FIRST_RAYS, sums):
         yield 0.0
-    blocked = estimator.to_world(sample, estimator.means(sample, sums, 0, FIRST_RAYS))
-    transfer = sh.cosine_lobe(mesh.normals[sample], order) - blocked
+    transfer = estimator.transfer(pool, sample, estimator.means(sample, sums, 0, FIRST_RAYS))
     return float(np.sqrt(np.square(transfer).sum(1).mean())), len(sample) * FIRST_RAYS
 
 
 def _trace_block(estimator: BlockedEstimator, block: NDArray, order: int, rays: int | None,
                  variance: float | None, pool: ThreadPoolExecutor, threads: int
                  ) -> Generator[float, None, tuple[NDArray, NDArray]]:
-    """Blocked part (n, K) of a block of points and the rays each took (n,).
+    """Transfer (n, K) of a block of points and the rays each took (n,).
 
     Either `rays` each, or doubling until the mean squared error is `variance` (see `_to_continue`).
     """
@@ -99,7 +96,7 @@ def _trace_block(estimator: BlockedEstimator, block: NDArray, order: int, rays: 
     sums = np.zeros((count, sh.coefficient_count(order)))
     if rays is not None:
         yield from estimator.trace(pool, threads, block, 0, rays, sums)
-        return estimator.to_world(block, estimator.means(block, sums, 0, rays)), np.full(count, rays)
+        return estimator.transfer(pool, block, estimator.means(block, sums, 0, rays)), np.full(count, rays)
     assert variance is not None
     local, squared_error, taken = np.zeros_like(sums), np.zeros(count), np.zeros(count, dtype=np.int32)
     active = np.arange(count)
@@ -120,7 +117,7 @@ def _trace_block(estimator: BlockedEstimator, block: NDArray, order: int, rays: 
         if stop >= MAX_RAYS:
             break
         start, stop = stop, 2 * stop
-    return estimator.to_world(block, local), taken
+    return estimator.transfer(pool, block, local), taken
 
 
 def _pooled(values: NDArray) -> NDArray:
@@ -172,8 +169,7 @@ def _measured_error(mesh: TriangleMesh, scene: Occluders, order: int, seed: int,
         sums = np.zeros((len(points), coefficients.shape[1]))
         for share in twin.trace(pool, threads, points, 0, int(rays), sums):
             yield (traced + share * len(points) * rays) / max(1, int(taken.sum()))
-        blocked = twin.to_world(points, twin.means(points, sums, 0, int(rays)))
-        again = sh.cosine_lobe(mesh.normals[points], order) - blocked
+        again = twin.transfer(pool, points, twin.means(points, sums, 0, int(rays)))
         squared += float(np.square(again - coefficients[points]).sum()) / 2
         traced += len(points) * int(rays)
     energy = float(np.square(coefficients[sample], dtype=np.float64).sum())

@@ -25,6 +25,8 @@ SETS = 16
 MAX_RAYS = 4096
 RAYS_PER_JOB = 1 << 16  # about 15 ms of one thread: short enough to stop at once, long enough to be efficient
 
+_TURNED_AT_ONCE = 2048  # points rotated by one worker at a time
+
 
 class BlockedEstimator:
     """Sums of Y_k over blocked rays, in each point's local frame."""
@@ -122,9 +124,14 @@ class BlockedEstimator:
         share = mean[:, :1] / sh.normalisation(0, 0)  # Y_0 is constant, so this counts the blocked rays
         return mean + share * self._excess[start, stop][self._set_of_point[points]]
 
-    def to_world(self, points: NDArray, local: NDArray) -> NDArray[np.float64]:
-        """Local coefficients (n, K) of these points in the bake frame."""
-        return sh.rotate_each(local, self._frames(points))
+    def transfer(self, pool: ThreadPoolExecutor, points: NDArray, local: NDArray) -> NDArray[np.float64]:
+        """Transfer (n, K) in the bake frame: the exact unshadowed part minus the blocked part (n, K), local."""
+        def part(start: int) -> NDArray[np.float64]:
+            here = slice(start, start + _TURNED_AT_ONCE)
+            return (sh.cosine_lobe(self._normals[points[here]], self._order)
+                    - sh.rotate_each(local[here], self._frames(points[here])))
+
+        return np.concatenate(list(pool.map(part, range(0, len(points), _TURNED_AT_ONCE))))
 
     def _frames(self, points: NDArray) -> NDArray[np.float64]:
         return sampling.frames(self._normals[points], self._angles[points].astype(np.float64))
