@@ -7,7 +7,7 @@ import statistics
 import numpy as np
 from meshes import load
 from numpy.typing import NDArray
-from peers import Mitsuba, Open3D, Trimesh
+from peers import Mitsuba, MitsubaArrays, Open3D, Trimesh
 from table import Table, interleaved, ratio, seconds
 
 from neural_gash_addon.backend import methods
@@ -44,7 +44,7 @@ def _equal_error(table: Table, name: str, mesh: TriangleMesh, reference: NDArray
     def bake() -> float:
         return seconds(lambda: methods.run(methods.bake(mesh, order=ORDER, tolerance=tolerance, threads=threads)))
 
-    for peer in (Trimesh, Open3D, Mitsuba):
+    for peer in (Trimesh, Open3D, MitsubaArrays, Mitsuba):
         try:
             caster = peer(mesh, ORDER)
         except (ImportError, OSError) as reason:
