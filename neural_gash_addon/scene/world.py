@@ -67,7 +67,9 @@ def _background(world: bpy.types.World | None, order: int) -> Array:
         raise UserError(f"The Environment Texture of the World '{world.name}' is a mirror ball; "
                         "only equirectangular images can be read as light.")
     rotation = _mapping(world.name, colour)
-    image = sh_light.project_equirect(_linear_pixels(world.name, colour.image), order)
+    if colour.image is None:
+        raise UserError(f"The Environment Texture of the World '{world.name}' has no image.")
+    image = sh_light.project_equirect(linear_pixels(colour.image), order)
     return strength * sh.rotate(image, rotation)
 
 
@@ -124,17 +126,18 @@ def _is_direction(node: bpy.types.Node | None, socket: bpy.types.NodeSocket) -> 
     return node is not None and node.type == "TEX_COORD" and socket.links[0].from_socket.name == "Generated"
 
 
-def _linear_pixels(world: str, image: bpy.types.Image | None) -> NDArray[np.float32]:
-    """(H, W, C) scene-linear pixels, row 0 at the bottom."""
-    if image is None:
-        raise UserError(f"The Environment Texture of the World '{world}' has no image.")
+def linear_pixels(image: bpy.types.Image) -> NDArray[np.float32]:
+    """(H, W, C) scene-linear pixels of an image, row 0 at the bottom.
+
+    Raises:
+        UserError: it is no single image, cannot be loaded, or is in a colour space that is not read.
+    """
     if image.source not in ("FILE", "GENERATED"):
-        raise UserError(f"The image '{image.name}' of the World '{world}' is a {image.source.lower()}; "
+        raise UserError(f"The image '{image.name}' is a {image.source.lower()}; "
                         "only single images can be read as light.")
     width, height = image.size  # loads the file where it is not yet
     if not image.pixels or not width or not height:
-        raise UserError(f"The image '{image.name}' of the World '{world}' cannot be loaded from "
-                        f"'{bpy.path.abspath(image.filepath)}'.")
+        raise UserError(f"The image '{image.name}' cannot be loaded from '{bpy.path.abspath(image.filepath)}'.")
     pixels = np.empty((height, width, image.channels), np.float32)
     image.pixels.foreach_get(pixels.ravel())
     if image.channels < 3:  # grey, with or without alpha
@@ -143,7 +146,7 @@ def _linear_pixels(world: str, image: bpy.types.Image | None) -> NDArray[np.floa
     if image.is_float or space.is_data or space.name.startswith("Linear"):
         return pixels  # float images come in scene-linear, whatever they were stored in
     if space.name != "sRGB":
-        raise UserError(f"The image '{image.name}' of the World '{world}' is in the colour space "
+        raise UserError(f"The image '{image.name}' is in the colour space "
                         f"'{space.name}'; sRGB, linear and float images can be read as light.")
     return np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4)
 

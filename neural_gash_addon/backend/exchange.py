@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Bakes as .npz files, for people who compute. No pickles."""
+from __future__ import annotations
+
+import os
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import UserError
+from .geometry import TriangleMesh
+from .record import BakeRecord
+from .transfer import Transfer
+
+
+def check_writable(path: Path) -> None:
+    """UserError unless a file can be made beside `path` and take its place."""
+    if path.is_dir():
+        raise UserError(f"'{path}' is a folder, not a file to write.")
+    try:
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise UserError(f"The folder '{path.parent}' cannot be written to ({reason.lower()}).") from error
+
+
+@contextmanager
+def atomic(path: Path) -> Iterator[Path]:
+    """A file beside `path`, of the same suffix, to write; it takes the place of `path` only once whole."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
+    os.close(handle)
+    draft = Path(name)
+    try:
+        yield draft
+        mask = os.umask(0)
+        os.umask(mask)
+        draft.chmod(0o666 & ~mask)  # mkstemp's files are for their owner only
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def save_npz(path: Path, mesh: TriangleMesh, transfer: Transfer) -> None:
+    """Write positions (N, 3), normals (N, 3), transfer (N, K), domain, elements (E,) and record (JSON text).
+
+    For the POINT domain the points are the mesh's vertices in their order; for CORNER,
+    `elements` gives the point of each face corner.
+    """
+    with atomic(path) as draft, draft.open("wb") as file:
+        np.savez_compressed(file, positions=mesh.points.astype(np.float32), normals=mesh.normals.astype(np.float32),
+                            transfer=transfer.coefficients, domain=np.array(mesh.domain), elements=mesh.elements,
+                            record=np.array(transfer.record.to_json()))
+
+
+def load_npz(path: Path) -> tuple[dict[str, NDArray], BakeRecord]:
+    """The arrays of a file that `save_npz` wrote, and its record.
+
+    Raises:
+        UserError: the file is missing, or no such file.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {key: data[key] for key in ("positions", "normals", "transfer", "domain")}
+            record = str(data["record"])
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise UserError(f"'{path}' is missing or no bake that Neural GASh saved.") from error
+    return arrays, BakeRecord.from_json(record)

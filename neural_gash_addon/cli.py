@@ -1,0 +1,299 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The same jobs without a window: `blender --command neural_gash …`, `python -m neural_gash_addon …`."""
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from .backend import exchange, methods, shading
+from .backend import light as sh_light
+from .backend.errors import UserError
+from .ops.job import finish, prepare, summary
+from .properties import COLLECTION, RAYS, TOLERANCE
+from .scene import lighting
+from .scene.attributes import has_bake, read_record
+from .scene.preview import preview_on
+from .scene.render import render_preview
+from .scene.world import linear_pixels, rotated_light
+
+OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+_IMPORTERS: dict[str, Callable[[str], object]] = {
+    ".obj": lambda path: bpy.ops.wm.obj_import(filepath=path),
+    ".ply": lambda path: bpy.ops.wm.ply_import(filepath=path, forward_axis="Y", up_axis="Z"),
+    ".stl": lambda path: bpy.ops.wm.stl_import(filepath=path),
+    ".glb": lambda path: bpy.ops.import_scene.gltf(filepath=path),
+}
+
+
+def _parser() -> argparse.ArgumentParser:
+    """The one argument parser."""
+    parser = argparse.ArgumentParser(
+        prog="neural_gash", description="Bake and relight precomputed radiance transfer.",
+        epilog="Exit codes: 0 done; 1 failed inside; 2 bad input or usage; 130 interrupted.")
+    commands = parser.add_subparsers(dest="command", required=True)
+
+    bake = commands.add_parser("bake", help="bake a mesh object of a file",
+                               epilog=parser.epilog)
+    bake.add_argument("input", metavar="INPUT", help=".blend, .obj, .ply, .glb or .stl")
+    bake.add_argument("--object", metavar="NAME", help="which object; needed where the file has several meshes")
+    bake.add_argument("--method", choices=list(methods.METHODS), default="embree")
+    bake.add_argument("--order", type=int, default=3, help="bands of spherical harmonics, 2 to 5 (3)")
+    quality = bake.add_mutually_exclusive_group()
+    quality.add_argument("--rays", type=int, help="rays from every point")
+    quality.add_argument("--tolerance", type=float, help="relative L2 error to reach (0.02)")
+    bake.add_argument("--occluders", default="self", metavar="self|visible|COLLECTION",
+                      help="what casts shadows on the object (self)")
+    bake.add_argument("--out", metavar="OUT.blend", type=Path, help="save the file with the bake in it")
+    bake.add_argument("--npz", metavar="OUT.npz", type=Path, help="save points and coefficients")
+    bake.add_argument("--png", metavar="OUT.png", type=Path, help="render the object as baked")
+    bake.add_argument("--json", action="store_true", help="print the record as one line of JSON")
+
+    relight = commands.add_parser("relight", help="render or evaluate a baked file under another light",
+                                  epilog=parser.epilog)
+    relight.add_argument("input", metavar="INPUT", help="baked .blend or .npz")
+    relight.add_argument("--object", metavar="NAME", help="which object; needed where several are baked")
+    relight.add_argument("--hdri", metavar="FILE", type=Path, help="equirectangular image; else the file's World")
+    relight.add_argument("--rotation", type=float, default=0.0, metavar="DEG", help="about the vertical axis (0)")
+    relight.add_argument("--strength", type=float, default=1.0, help="factor on the light (1)")
+    relight.add_argument("--png", metavar="OUT.png", type=Path, help="render (a .blend only)")
+    relight.add_argument("--npz", metavar="OUT.npz", type=Path, help="save radiance (N, 3), albedo 1 (a .npz only)")
+    relight.add_argument("--json", action="store_true", help="print a summary as one line of JSON")
+    return parser
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run a command line; the exit code."""
+    try:
+        arguments = _parser().parse_args(argv)
+    except SystemExit as end:  # argparse has said why
+        return int(end.code or 0)
+    try:
+        for output in (arguments.png, arguments.npz, getattr(arguments, "out", None)):
+            if output is not None:
+                exchange.check_writable(output.absolute())
+        with _silent_blender():
+            data, text = _COMMANDS[arguments.command](arguments)
+        print(json.dumps(data, sort_keys=True) if arguments.json else text, flush=True)
+    except UserError as error:
+        print(f"neural_gash: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("neural_gash: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    return OK
+
+
+def _bake(arguments: argparse.Namespace) -> tuple[dict, str]:
+    """`bake`."""
+    if not (arguments.out or arguments.npz or arguments.png or arguments.json):
+        raise UserError("Nothing of this bake would be kept; add --out, --npz, --png or --json.")
+    if arguments.out and arguments.out.suffix != ".blend":
+        raise UserError("--out takes a .blend file.")
+    _open(arguments.input)
+    obj = _choose([o for o in bpy.context.scene.objects if o.type == "MESH"], arguments.object, "mesh")
+    settings = bpy.context.scene.neural_gash
+    settings.method, settings.order = arguments.method, _in_range(arguments.order)
+    settings.quality = TOLERANCE if arguments.rays is None else RAYS
+    if arguments.rays is not None:
+        settings.rays = max(arguments.rays, 0)
+        if settings.rays != arguments.rays:
+            raise UserError(f"The number of rays cannot be {arguments.rays}.")
+    if arguments.tolerance is not None:
+        settings.tolerance = arguments.tolerance
+        if not math.isclose(settings.tolerance, arguments.tolerance, rel_tol=1e-5):
+            raise UserError(f"The tolerance must be {methods.MIN_TOLERANCE:g} to 1, not {arguments.tolerance:g}.")
+    if arguments.occluders.upper() in ("SELF", "VISIBLE"):
+        settings.occluders = arguments.occluders.upper()
+    else:
+        settings.occluders = COLLECTION
+        settings.collection = bpy.data.collections.get(arguments.occluders)
+        if settings.collection is None:
+            raise UserError(f"There is no collection named '{arguments.occluders}' in the file.")
+    job = prepare(bpy.context, obj, settings)
+    transfer = methods.run(job.baking, _progress_bar())
+    record, warning = finish(bpy.context, job, transfer)
+    if warning:
+        print(f"neural_gash: {warning}", file=sys.stderr)
+    if arguments.npz:
+        exchange.save_npz(arguments.npz.absolute(), job.mesh, type(transfer)(transfer.coefficients, record))
+    if arguments.png:
+        render_preview([obj], arguments.png.absolute(), camera=bpy.context.scene.camera)
+    if arguments.out:
+        _save(arguments.out.absolute())
+    return {"object": obj.name, **asdict(record)}, f"{obj.name}: {summary(record)}."
+
+
+def _relight(arguments: argparse.Namespace) -> tuple[dict, str]:
+    """`relight`."""
+    suffix = Path(arguments.input).suffix.lower()
+    turn = (math.radians(arguments.rotation), arguments.strength)
+    if suffix == ".npz":
+        if arguments.png or arguments.object:
+            raise UserError("A .npz has no mesh to render; give the .blend for --png, or --npz for numbers.")
+        if arguments.hdri is None:
+            raise UserError("A .npz has no World; give the light with --hdri.")
+        arrays, record = exchange.load_npz(Path(arguments.input))
+        light = rotated_light(_hdri_light(arguments.hdri, record.order), *turn)
+        radiance = shading.radiance(arrays["transfer"], light).astype(np.float32)
+        if arguments.npz:
+            with exchange.atomic(arguments.npz.absolute()) as draft, draft.open("wb") as file:
+                np.savez_compressed(file, positions=arrays["positions"], radiance=radiance, light=light)
+        name = Path(arguments.input).name
+    elif suffix == ".blend":
+        if arguments.npz:
+            raise UserError("--npz relights a .npz; bake with --npz to get one.")
+        _open(arguments.input)
+        obj = _choose([o for o in bpy.context.scene.objects if has_bake(o)], arguments.object, "baked")
+        record = read_record(obj)
+        scene = bpy.context.scene
+        if arguments.hdri is None:
+            lighting.take_light(scene)
+        else:
+            lighting.store_light(scene, _hdri_light(arguments.hdri, methods.sh.MAX_ORDER))
+        scene.neural_gash.light_rotation, scene.neural_gash.light_strength = turn
+        preview_on(obj)
+        lighting.light_object(scene, obj)
+        if arguments.png:
+            render_preview([obj], arguments.png.absolute(), camera=scene.camera)
+        light, name = lighting.current_light(scene, record.order), obj.name
+    else:
+        raise UserError(f"'{arguments.input}' is neither a .blend nor a .npz.")
+    return {"object": name, "light": light.tolist()}, f"{name}: relit."
+
+
+_COMMANDS = {"bake": _bake, "relight": _relight}
+
+
+def _open(name: str) -> None:
+    """Open a .blend, or import a mesh into an empty file. UserError where that fails."""
+    path = Path(name).absolute()
+    if not path.is_file():
+        raise UserError(f"There is no file '{name}'.")
+    suffix = path.suffix.lower()
+    try:
+        if suffix == ".blend":
+            bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False)
+        elif suffix in _IMPORTERS:
+            bpy.ops.wm.read_homefile(use_factory_startup=True, use_empty=True)
+            _IMPORTERS[suffix](str(path))
+            world = bpy.data.worlds.new("Sky")  # a mesh file has no light; a white sky shows its shape
+            world.color = (1, 1, 1)
+            bpy.context.scene.world = world
+            if suffix == ".ply":
+                _shade_smooth()
+        else:
+            raise UserError(f"'{name}' is none of .blend, .obj, .ply, .glb, .stl.")
+    except RuntimeError as error:
+        raise UserError(f"'{name}' cannot be read: {_first_line(error)}") from error
+
+
+def _shade_smooth() -> None:
+    """PLY has no faces' shading: vertex normals mean smooth, and so do none."""
+    for mesh in bpy.data.meshes:
+        if not mesh.has_custom_normals:
+            mesh.shade_smooth()
+
+
+def _choose(candidates: list[bpy.types.Object], name: str | None, kind: str) -> bpy.types.Object:
+    """The object of this name, or the only one, or the active one."""
+    if name is not None:
+        obj = bpy.context.scene.objects.get(name)
+        if obj is None:
+            raise UserError(f"There is no object named '{name}' in the scene.")
+        return obj
+    active = bpy.context.view_layer.objects.active
+    if active in candidates:
+        return active
+    if len(candidates) == 1:
+        return candidates[0]
+    if not candidates:
+        raise UserError(f"The file has no {kind} object.")
+    names = ", ".join(sorted(o.name for o in candidates)[:8])
+    raise UserError(f"The file has several {kind} objects; choose one with --object: {names}.")
+
+
+def _in_range(order: int) -> int:
+    if not methods.MIN_ORDER <= order <= methods.sh.MAX_ORDER:
+        raise UserError(f"The order must be {methods.MIN_ORDER} to {methods.sh.MAX_ORDER}, not {order}.")
+    return order
+
+
+def _hdri_light(path: Path, order: int) -> np.ndarray:
+    """(K, 3) of an image file."""
+    if not path.is_file():
+        raise UserError(f"There is no HDRI file '{path}'.")
+    try:
+        image = bpy.data.images.load(str(path.absolute()))
+    except RuntimeError as error:
+        raise UserError(f"The HDRI '{path}' cannot be read: {_first_line(error)}") from error
+    try:
+        return sh_light.project_equirect(linear_pixels(image), order)
+    finally:
+        bpy.data.images.remove(image)
+
+
+def _save(path: Path) -> None:
+    """Save the open file at `path` in one step: until then, what was there stays."""
+    bpy.context.preferences.filepaths.save_version = 0
+    with exchange.atomic(path) as draft:
+        try:
+            bpy.ops.wm.save_as_mainfile(filepath=str(draft), copy=True, check_existing=False)
+        except RuntimeError as error:
+            raise UserError(f"'{path}' cannot be written: {_first_line(error)}") from error
+
+
+def _progress_bar() -> Callable[[float], None] | None:
+    """A bar on a terminal; None elsewhere."""
+    if not sys.stderr.isatty():
+        return None
+
+    def show(share: float) -> None:
+        end = "\n" if share >= 1 else ""
+        print(f"\rbaking [{'#' * round(40 * share):<40}] {100 * share:3.0f} %", end=end, file=sys.stderr, flush=True)
+
+    return show
+
+
+@contextmanager
+def _silent_blender() -> Iterator[None]:
+    """Keep what Blender itself writes to standard output off it: that is for the report."""
+    sys.stdout.flush()
+    saved, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        os.dup2(saved, 1)
+        os.close(saved)
+        os.close(nowhere)
+
+
+def _first_line(error: Exception) -> str:
+    """An operator's report without its 'Error: '."""
+    return str(error).strip().splitlines()[0].removeprefix("Error: ")
+
+
+_command = None
+
+
+def register() -> None:
+    """Make `blender --command neural_gash …` known."""
+    global _command
+    _command = bpy.utils.register_cli_command("neural_gash", main)
+
+
+def unregister() -> None:
+    """Forget it."""
+    bpy.utils.unregister_cli_command(_command)

@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Operators: read the scene, call the backend, write the result."""
+import bpy
+
+from .bake import NEURAL_GASH_OT_bake, NEURAL_GASH_OT_bake_applied_copy
+from .preview import NEURAL_GASH_OT_clear, NEURAL_GASH_OT_light_from_world, NEURAL_GASH_OT_preview
+
+CLASSES = (NEURAL_GASH_OT_bake, NEURAL_GASH_OT_bake_applied_copy, NEURAL_GASH_OT_clear, NEURAL_GASH_OT_preview,
+           NEURAL_GASH_OT_light_from_world)
+
+
+def register() -> None:
+    """Register the operators."""
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+
+
+def unregister() -> None:
+    """Unregister them."""
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Clear, Preview and Light from World."""
+from __future__ import annotations
+
+import bpy
+
+from ..backend.errors import UserError
+from ..scene.attributes import clear, has_bake
+from ..scene.lighting import apply_light, light_object, take_light
+from ..scene.preview import is_on, preview_off, preview_on
+from . import state
+
+
+def _needs_bake(cls, context: bpy.types.Context) -> bool:
+    """Shared poll: there is a bake on the active object, and none is running."""
+    reason = ""
+    if state.running:
+        reason = "A bake is running; press Esc to cancel it."
+    elif not has_bake(context.object):
+        reason = "The active object has not been baked."
+    if reason:
+        cls.poll_message_set(reason)
+    return not reason
+
+
+class NEURAL_GASH_OT_clear(bpy.types.Operator):
+    """Remove the bake from the active object and give its materials back"""
+
+    bl_idname = "neural_gash.clear"
+    bl_label = "Clear"
+    bl_options = {"REGISTER", "UNDO"}
+
+    poll = classmethod(_needs_bake)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Remove attributes, record and preview."""
+        if context.object.library or context.object.data.library or context.object.mode == "EDIT":
+            self.report({"ERROR"}, f"'{context.object.name}' is linked or in Edit Mode, so its bake cannot be removed.")
+            return {"CANCELLED"}
+        preview_off(context.object)
+        clear(context.object)
+        return {"FINISHED"}
+
+
+class NEURAL_GASH_OT_preview(bpy.types.Operator):
+    """Show the baked shading, or give the original materials back"""
+
+    bl_idname = "neural_gash.preview"
+    bl_label = "Preview"
+    bl_options = {"REGISTER", "UNDO"}
+
+    poll = classmethod(_needs_bake)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Toggle."""
+        obj = context.object
+        if is_on(obj):
+            preview_off(obj)
+            return {"FINISHED"}
+        try:
+            preview_on(obj)
+        except UserError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        light_object(context.scene, obj)
+        return {"FINISHED"}
+
+
+class NEURAL_GASH_OT_light_from_world(bpy.types.Operator):
+    """Light the previews by the World as it is now, and by the sun lamps"""
+
+    bl_idname = "neural_gash.light_from_world"
+    bl_label = "Light from World"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Project the World once; the sliders turn and scale the result."""
+        try:
+            take_light(context.scene)
+        except UserError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        apply_light(context.scene)
+        return {"FINISHED"}

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The N-panel: layout only. Nothing here reads a mesh."""
+from __future__ import annotations
+
+from functools import lru_cache
+
+import bpy
+
+from ..backend.errors import UserError
+from ..backend.methods import METHODS
+from ..backend.record import BakeRecord
+from ..ops import state
+from ..properties import COLLECTION, RAYS
+from ..scene import staleness
+from ..scene.attributes import RECORD, has_bake
+from ..scene.preview import is_on
+
+
+@lru_cache(maxsize=64)
+def _record(text: str) -> BakeRecord | str:
+    """The record in a JSON text, or why it cannot be read; parsed once."""
+    try:
+        return BakeRecord.from_json(text)
+    except UserError as error:
+        return str(error)
+
+
+class _Panel:
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "Neural GASh"
+
+
+class NEURAL_GASH_PT_main(_Panel, bpy.types.Panel):
+    """Bake, see, light."""
+
+    bl_idname = "NEURAL_GASH_PT_main"
+    bl_label = "Neural GASh"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """The one thing to press, or how far it is."""
+        layout = self.layout
+        obj = context.object
+        if state.running:
+            layout.progress(factor=state.progress, text=f"Baking: {100 * state.progress:.0f} %")
+            layout.label(text="Esc cancels", icon="EVENT_ESC")
+            return
+        column = layout.column()
+        column.scale_y = 1.6
+        column.operator("neural_gash.bake", icon="RENDER_STILL")
+        if obj is not None and obj.type == "MESH" and obj.modifiers:
+            layout.operator("neural_gash.bake_applied_copy", icon="DUPLICATE")
+        row = layout.row(align=True)
+        row.operator("neural_gash.preview", icon="HIDE_OFF" if is_on(obj) else "HIDE_ON", depress=is_on(obj))
+        row.operator("neural_gash.clear", icon="TRASH")
+        if has_bake(obj):
+            self._readout(layout.box(), obj)
+
+    def _readout(self, box: bpy.types.UILayout, obj: bpy.types.Object) -> None:
+        """The last bake in a few lines."""
+        record = _record(obj.data[RECORD])
+        if isinstance(record, str):
+            box.label(text=record, icon="ERROR")
+            return
+        stale = staleness.status(obj) == staleness.STALE
+        box.alert = stale
+        box.label(text="Changed since the bake" if stale else "Up to date", icon="ERROR" if stale else "CHECKMARK")
+        label = METHODS[record.method].label if record.method in METHODS else record.method
+        column = box.column(align=True)
+        column.label(text=f"{label}, order {record.order}, {record.points:,} points")
+        column.label(text=f"Time: {record.seconds:.2f} s")
+        if record.rays:
+            column.label(text=f"Rays: {record.rays_per_point:.0f} a point")
+        if record.error_estimate is not None:
+            column.label(text=f"Estimated error: {100 * record.error_estimate:.2g} %")
+
+
+class NEURAL_GASH_PT_light(_Panel, bpy.types.Panel):
+    """The light of the previews."""
+
+    bl_idname = "NEURAL_GASH_PT_light"
+    bl_label = "Light"
+    bl_parent_id = "NEURAL_GASH_PT_main"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Where it comes from, and the live sliders."""
+        layout = self.layout
+        layout.use_property_split = True
+        settings = context.scene.neural_gash
+        layout.operator("neural_gash.light_from_world", icon="WORLD")
+        layout.prop(settings, "light_rotation")
+        layout.prop(settings, "light_strength")
+        layout.prop(settings, "soften")
+
+
+class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):
+    """What the next bake does."""
+
+    bl_idname = "NEURAL_GASH_PT_settings"
+    bl_label = "Settings"
+    bl_parent_id = "NEURAL_GASH_PT_main"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """All of them."""
+        layout = self.layout
+        layout.use_property_split = True
+        settings = context.scene.neural_gash
+        layout.prop(settings, "method")
+        layout.prop(settings, "order")
+        if METHODS[settings.method].traces:
+            layout.prop(settings, "quality", expand=True)
+            layout.prop(settings, "rays" if settings.quality == RAYS else "tolerance")
+            layout.prop(settings, "occluders")
+            if settings.occluders == COLLECTION:
+                layout.prop(settings, "collection")
+
+
+CLASSES = (NEURAL_GASH_PT_main, NEURAL_GASH_PT_light, NEURAL_GASH_PT_settings)
+
+
+def register() -> None:
+    """Register the panels."""
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+
+
+def unregister() -> None:
+    """Unregister them."""
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The light of a scene's previews: taken from the World once, then only turned and scaled."""
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from ..backend import light as sh_light
+from ..backend import spherical_harmonics as sh
+from ..backend.errors import UserError
+from .attributes import read_record
+from .preview import is_on, update_light
+from .world import rotated_light, world_light
+
+_LIGHT = "neural_gash_light"  # custom property of the scene: (K, 3) of the highest order, flat
+
+
+def take_light(scene: bpy.types.Scene) -> None:
+    """Project the scene's World and suns, and keep the coefficients with the scene.
+
+    Raises:
+        UserError: the World is made of something that cannot be read as light.
+    """
+    store_light(scene, world_light(scene, sh.MAX_ORDER))
+
+
+def store_light(scene: bpy.types.Scene, light: np.ndarray) -> None:
+    """Keep light (K, 3) of the highest order, in world axes, as the light of the scene's previews."""
+    scene[_LIGHT] = light.ravel().tolist()
+
+
+def current_light(scene: bpy.types.Scene, order: int) -> np.ndarray:
+    """The light (K, 3) of the previews, as the sliders have it; a white sky before any was taken."""
+    stored = scene.get(_LIGHT)
+    if stored is None:
+        light = sh_light.constant(np.ones(3), sh.MAX_ORDER)
+    else:
+        light = np.array(stored, dtype=np.float64).reshape(-1, 3)
+    settings = scene.neural_gash
+    light = rotated_light(light[:order * order], settings.light_rotation, settings.light_strength)
+    return sh_light.window(light, order) if settings.soften else light
+
+
+def apply_light(scene: bpy.types.Scene) -> None:
+    """Light every preview in the scene. Damaged bakes keep the light they have."""
+    for obj in scene.objects:
+        if is_on(obj):
+            light_object(scene, obj)
+
+
+def light_object(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
+    """Light the preview of one object, where it is on."""
+    try:
+        order = read_record(obj).order
+    except UserError:
+        return  # the panel says that the record is damaged
+    update_light(obj, current_light(scene, order))
