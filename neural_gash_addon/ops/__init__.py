@@ -2,6 +2,7 @@
 """Operators: read the scene, call the backend, write the result."""
 import bpy
 
+from . import state
 from .bake import NEURAL_GASH_OT_bake, NEURAL_GASH_OT_bake_applied_copy
 from .preview import NEURAL_GASH_OT_clear, NEURAL_GASH_OT_light_from_world, NEURAL_GASH_OT_preview
 
@@ -16,6 +17,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Unregister them."""
+    """Unregister them, and stop a bake that runs."""
+    state.abandon()
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -8,6 +8,7 @@ import bpy
 
 from ..backend.errors import UserError
 from ..backend.methods import METHODS
+from ..backend.record import BakeRecord
 from ..backend.transfer import Transfer
 from ..scene.read import make_applied_copy, refusal
 from . import state
@@ -44,44 +45,34 @@ class Worker(threading.Thread):
         self._cancelled.set()
 
 
-class NEURAL_GASH_OT_bake(bpy.types.Operator):
-    """Bake how light reaches every point of the active mesh, and show it lit by the World"""
+class _Baking:
+    """What the two Bake operators share. They differ in the object that is baked."""
 
-    bl_idname = "neural_gash.bake"
-    bl_label = "Bake"
-    bl_options = {"REGISTER", "UNDO"}
+    def _begin(self, context: bpy.types.Context) -> bpy.types.Object:
+        """The object to bake. Raises UserError."""
+        return context.object
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Not while another bake runs, nor for what cannot be baked."""
-        reason = "A bake is running; press Esc to cancel it." if state.running else refusal(context.object)
-        if not reason and METHODS[context.scene.neural_gash.method].traces \
-                and not context.scene.neural_gash.occluder_mode():
-            reason = "Choose the collection whose objects cast shadows."
-        if reason:
-            cls.poll_message_set(reason)
-        return not reason
+    def _undo(self, context: bpy.types.Context) -> None:
+        """Take `_begin` back, as nothing came of it."""
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Bake at once."""
         try:
-            return self._report(*bake_object(context, context.object, context.scene.neural_gash))
+            return self._report(*bake_object(context, self._begin(context), context.scene.neural_gash))
         except UserError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+            return self._fail(context, error)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         """Read the scene, and bake beside the window."""
         try:
-            job = prepare(context, context.object, context.scene.neural_gash)
+            job = prepare(context, self._begin(context), context.scene.neural_gash)
         except UserError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+            return self._fail(context, error)
         self._job, self._worker = job, Worker(job)
         self._timer = context.window_manager.event_timer_add(_TICK, window=context.window)
         context.window_manager.modal_handler_add(self)
         context.window_manager.progress_begin(0, 100)
-        state.start()
+        state.start(self._worker)
         self._worker.start()
         return {"RUNNING_MODAL"}
 
@@ -96,23 +87,24 @@ class NEURAL_GASH_OT_bake(bpy.types.Operator):
         if self._worker.is_alive():
             state.progress = self._worker.progress
             context.window_manager.progress_update(100 * state.progress)
-            context.workspace.status_text_set(f"Baking {self._job.name}: {100 * state.progress:.0f} %   (Esc cancels)")
+            if context.workspace:
+                context.workspace.status_text_set(
+                    f"Baking {self._job.name}: {100 * state.progress:.0f} %   (Esc cancels)")
             state.redraw(context)
             return {"RUNNING_MODAL"}
         self._end(context)
         if self._worker.transfer is None:
-            self.report({"ERROR"}, f"The bake failed: {self._worker.error}")
-            return {"CANCELLED"}
+            return self._fail(context, self._worker.error or UserError("The bake was stopped."))
         try:
             return self._report(*finish(context, self._job, self._worker.transfer))
         except UserError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
+            return self._fail(context, error)
 
     def cancel(self, context: bpy.types.Context) -> None:
         """Stop without a trace; Blender calls it too, when the window or the file closes."""
         self._worker.cancel()
         self._end(context)
+        self._undo(context)
 
     def _end(self, context: bpy.types.Context) -> None:
         """Give back timer, status line and progress."""
@@ -124,49 +116,90 @@ class NEURAL_GASH_OT_bake(bpy.types.Operator):
             context.workspace.status_text_set(None)
         state.redraw(context)
 
-    def _report(self, record, warning: str) -> set[str]:
+    def _fail(self, context: bpy.types.Context, error: Exception) -> set[str]:
+        """Say why there is no bake, and leave everything as it was."""
+        self._undo(context)
+        self.report({"ERROR"}, str(error) if isinstance(error, UserError) else f"The bake failed: {error!r}.")
+        return {"CANCELLED"}
+
+    def _report(self, record: BakeRecord, warning: str) -> set[str]:
+        """Say how the bake went, in one line."""
         self.report({"INFO"}, f"{summary(record)}.")
         if warning:
             self.report({"WARNING"}, warning)
         return {"FINISHED"}
 
 
-class NEURAL_GASH_OT_bake_applied_copy(bpy.types.Operator):
+def _bake_refusal(context: bpy.types.Context) -> str:
+    """Why no bake can begin now; '' where one can."""
+    if state.running:
+        return "A bake is running; press Esc to cancel it."
+    settings = context.scene.neural_gash
+    if METHODS[settings.method].traces and not settings.occluder_mode():
+        return refusal(context.object) or "Choose the collection whose objects cast shadows."
+    return refusal(context.object)
+
+
+class NEURAL_GASH_OT_bake(_Baking, bpy.types.Operator):
+    """Bake how light reaches every point of the active mesh, and show it lit by the World"""
+
+    bl_idname = "neural_gash.bake"
+    bl_label = "Bake"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Not while another bake runs, nor for what cannot be baked."""
+        reason = _bake_refusal(context)
+        if reason:
+            cls.poll_message_set(reason)
+        return not reason
+
+
+class NEURAL_GASH_OT_bake_applied_copy(_Baking, bpy.types.Operator):
     """Make a copy of the object with its modifiers applied, and bake that; the object itself stays as it is"""
 
     bl_idname = "neural_gash.bake_applied_copy"
     bl_label = "Bake an Applied Copy"
     bl_options = {"REGISTER", "UNDO"}
 
+    _copy = 0  # session uid of the copy: pointers do not outlast an undo meanwhile
+
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """As Bake; and there must be modifiers to apply."""
-        reason = refusal(context.object)
-        if state.running:
-            reason = "A bake is running; press Esc to cancel it."
-        elif not reason and not context.object.modifiers:
+        reason = _bake_refusal(context)
+        if not reason and not context.object.modifiers:
             reason = f"'{context.object.name}' has no modifiers to apply."
         if reason:
             cls.poll_message_set(reason)
         return not reason
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        """Copy and select, then bake at once."""
-        return self._copy_and_bake(context, "EXEC_DEFAULT")
+    def _begin(self, context: bpy.types.Context) -> bpy.types.Object:
+        """The copy, selected and active in the original's place."""
+        self._original = context.object.session_uid
+        self._selected = {obj.session_uid for obj in context.selected_objects}
+        copy = make_applied_copy(context.object, context.evaluated_depsgraph_get())
+        self._copy = copy.session_uid
+        context.view_layer.update()
+        self._select(context, {copy.session_uid}, copy.session_uid)
+        return copy
 
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        """Copy and select, then bake beside the window."""
-        return self._copy_and_bake(context, "INVOKE_DEFAULT")
+    def _undo(self, context: bpy.types.Context) -> None:
+        """Remove the copy and select what was selected."""
+        copy = next((o for o in bpy.data.objects if self._copy and o.session_uid == self._copy), None)
+        if copy is None:
+            return
+        data = copy.data
+        bpy.data.objects.remove(copy)
+        if not data.users:
+            bpy.data.meshes.remove(data)
+        self._select(context, self._selected, self._original)
 
-    def _copy_and_bake(self, context: bpy.types.Context, how: str) -> set[str]:
-        try:
-            copy = make_applied_copy(context.object, context.evaluated_depsgraph_get())
-        except UserError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        for obj in context.selected_objects:
-            obj.select_set(False)
-        copy.select_set(True)
-        context.view_layer.objects.active = copy
-        bpy.ops.neural_gash.bake(how)
-        return {"FINISHED"}
+    @staticmethod
+    def _select(context: bpy.types.Context, selected: set[int], active: int) -> None:
+        """Select the objects with these session uids, and no others."""
+        for obj in context.view_layer.objects:
+            obj.select_set(obj.session_uid in selected)
+            if obj.session_uid == active:
+                context.view_layer.objects.active = obj

@@ -12,11 +12,11 @@ from ..backend.errors import UserError
 from ..backend.geometry import TriangleMesh
 from ..backend.record import BakeRecord
 from ..backend.transfer import Transfer
-from ..properties import RAYS, NeuralGashSettings
+from ..properties import COLLECTION, RAYS, NeuralGashSettings
 from ..scene.attributes import write_transfer
 from ..scene.lighting import light_object, take_light
 from ..scene.preview import preview_off, preview_on
-from ..scene.read import SELF, fingerprint, read_object, read_occluders, refusal, same_fingerprint
+from ..scene.read import SELF, VISIBLE, fingerprint, read_object, read_occluders, refusal, same_fingerprint
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +42,9 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
     mode = settings.occluder_mode() if method.traces else SELF
     if not mode:
         raise UserError("Choose the collection whose objects cast shadows.")
+    if mode in (SELF, VISIBLE) and settings.occluders == COLLECTION:
+        raise UserError(f"A collection named '{mode}' cannot cast shadows, as the name has another meaning; "
+                        "rename it.")
     occluders = read_occluders(obj, mode, depsgraph)
     by_rays = settings.quality == RAYS
     baking = methods.bake(
@@ -94,5 +97,10 @@ def summary(record: BakeRecord) -> str:
     if record.rays:
         text += f", {record.rays_per_point:.0f} rays a point"
     if record.error_estimate is not None:
-        text += f", estimated error {100 * record.error_estimate:.2g} %"
+        text += f", estimated error {percent(record.error_estimate)}"
     return text
+
+
+def percent(part: float) -> str:
+    """A part of 1 in words fit for people."""
+    return "below 0.01 %" if part < 1e-4 else f"{100 * part:.2g} %"

@@ -11,16 +11,17 @@ from ..scene.preview import is_on, preview_off, preview_on
 from . import state
 
 
-def _needs_bake(cls, context: bpy.types.Context) -> bool:
-    """Shared poll: there is a bake on the active object, and none is running."""
-    reason = ""
+def _refusal(obj: bpy.types.Object | None) -> str:
+    """Why there is nothing to show or clear on `obj`; '' where there is."""
     if state.running:
-        reason = "A bake is running; press Esc to cancel it."
-    elif not has_bake(context.object):
-        reason = "The active object has not been baked."
-    if reason:
-        cls.poll_message_set(reason)
-    return not reason
+        return "A bake is running; press Esc to cancel it."
+    if obj is None:
+        return "No object is active; click a baked object to make it the active one."
+    if not has_bake(obj) and not is_on(obj):  # a preview may outlive its bake, and must still go off
+        return f"'{obj.name}' has not been baked."
+    if obj.library or obj.data.library:
+        return f"'{obj.name}' is linked from another file, where it cannot be changed."
+    return ""
 
 
 class NEURAL_GASH_OT_clear(bpy.types.Operator):
@@ -30,13 +31,18 @@ class NEURAL_GASH_OT_clear(bpy.types.Operator):
     bl_label = "Clear"
     bl_options = {"REGISTER", "UNDO"}
 
-    poll = classmethod(_needs_bake)
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """There is a bake, on a mesh that can be changed."""
+        reason = _refusal(context.object)
+        if not reason and context.object.mode == "EDIT":
+            reason = f"'{context.object.name}' is in Edit Mode; leave it to clear the bake."
+        if reason:
+            cls.poll_message_set(reason)
+        return not reason
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Remove attributes, record and preview."""
-        if context.object.library or context.object.data.library or context.object.mode == "EDIT":
-            self.report({"ERROR"}, f"'{context.object.name}' is linked or in Edit Mode, so its bake cannot be removed.")
-            return {"CANCELLED"}
         preview_off(context.object)
         clear(context.object)
         return {"FINISHED"}
@@ -49,7 +55,13 @@ class NEURAL_GASH_OT_preview(bpy.types.Operator):
     bl_label = "Preview"
     bl_options = {"REGISTER", "UNDO"}
 
-    poll = classmethod(_needs_bake)
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """There is a bake to show, or a preview to end."""
+        reason = _refusal(context.object)
+        if reason:
+            cls.poll_message_set(reason)
+        return not reason
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Toggle."""

@@ -6,18 +6,26 @@ import bpy
 
 running = False
 progress = 0.0
+_worker = None  # of the bake that runs; it has cancel()
 
 
-def start() -> None:
+def start(worker) -> None:
     """A bake begins."""
-    global running, progress
-    running, progress = True, 0.0
+    global running, progress, _worker
+    running, progress, _worker = True, 0.0, worker
 
 
 def stop() -> None:
     """It ended, however."""
-    global running
-    running = False
+    global running, _worker
+    running, _worker = False, None
+
+
+def abandon() -> None:
+    """The add-on goes: stop the worker, which no operator will hear of any more."""
+    if _worker is not None:
+        _worker.cancel()
+    stop()
 
 
 def redraw(context: bpy.types.Context) -> None:

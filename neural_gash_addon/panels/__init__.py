@@ -10,6 +10,7 @@ from ..backend.errors import UserError
 from ..backend.methods import METHODS
 from ..backend.record import BakeRecord
 from ..ops import state
+from ..ops.job import percent
 from ..properties import COLLECTION, RAYS
 from ..scene import staleness
 from ..scene.attributes import RECORD, has_bake
@@ -72,7 +73,7 @@ class NEURAL_GASH_PT_main(_Panel, bpy.types.Panel):
         if record.rays:
             column.label(text=f"Rays: {record.rays_per_point:.0f} a point")
         if record.error_estimate is not None:
-            column.label(text=f"Estimated error: {100 * record.error_estimate:.2g} %")
+            column.label(text=f"Estimated error: {percent(record.error_estimate)}")
 
 
 class NEURAL_GASH_PT_light(_Panel, bpy.types.Panel):
