@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Run by test_ship.py in a process of its own: install the zip, bake, disable; argv: zip, may the site's embreex serve."""
+import sys
+
+import bpy
+
+ID = "bl_ext.user_default.neural_gash"
+
+
+def registered() -> set[str]:
+    """Everything of ours that Blender knows."""
+    found = {name for name in dir(bpy.types) if name.startswith("NEURAL_GASH_") or name == "NeuralGashSettings"}
+    found |= {"Scene.neural_gash"} if hasattr(bpy.types.Scene, "neural_gash") else set()
+    found |= {f"op {name}" for name in dir(bpy.ops.neural_gash)}
+    for name in dir(bpy.app.handlers):
+        handlers = getattr(bpy.app.handlers, name)
+        if isinstance(handlers, list):
+            found |= {f"{name} {h}" for h in handlers if "neural_gash" in getattr(h, "__module__", "")}
+    return found
+
+
+before = registered()
+assert not before, before
+bpy.ops.extensions.package_install_files(filepath=sys.argv[1], repo="user_default", enable_on_install=True)
+assert ID in bpy.context.preferences.addons
+import embreex  # noqa: E402
+
+if sys.argv[2] == "bundled":
+    assert ".local" in embreex.__file__, embreex.__file__
+
+bpy.ops.wm.read_homefile(use_factory_startup=True)
+bpy.ops.object.select_all(action="SELECT")
+bpy.ops.object.delete()
+bpy.ops.mesh.primitive_torus_add()
+bpy.ops.object.shade_smooth()
+bpy.context.scene.neural_gash.order = 4
+assert bpy.ops.neural_gash.bake() == {"FINISHED"}
+attributes = [name for name in bpy.context.object.data.attributes.keys() if name.startswith("_prt_")]
+assert attributes == [f"_prt_{i}" for i in range(4)], attributes
+assert "embree" in bpy.context.object.data["neural_gash"]
+assert registered()
+
+bpy.ops.preferences.addon_disable(module=ID)
+assert not registered(), registered()
+timers = [name for name in sys.modules if name.startswith(ID) and hasattr(sys.modules[name], "_compare_changed")
+          and bpy.app.timers.is_registered(sys.modules[name]._compare_changed)]
+assert not timers, timers
+print("installed, baked, disabled")
