@@ -2,8 +2,11 @@
 """Ambient occlusion, the one coefficient that others bake, beside our first coefficient."""
 from __future__ import annotations
 
+import contextlib
+import os
 import statistics
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from meshes import load
@@ -58,12 +61,27 @@ def _cycles(mesh: TriangleMesh) -> Callable[[int, int], NDArray]:
 
     def bake(samples: int, seed: int) -> NDArray:
         scene.cycles.samples, scene.cycles.seed = samples, seed
-        bpy.ops.object.bake(type="AO")
+        with _quiet():
+            bpy.ops.object.bake(type="AO")
         out = np.empty(4 * len(mesh.positions), np.float32)
         data.attributes["ao"].data.foreach_get("color", out)
         return out.reshape(-1, 4)[:, 0]
 
     return bake
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep what Blender's own code prints out of the table."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    with open(os.devnull, "w", encoding="ascii") as sink:
+        os.dup2(sink.fileno(), 1)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
 
 
 def _error(bake: Callable[[int], NDArray]) -> float:
@@ -87,7 +105,7 @@ def measure(table: Table, threads: int) -> None:
     for label, make in (("libigl embree.ambient_occlusion", _igl), ("Cycles AO bake", _cycles)):
         try:
             peer = make(mesh)
-        except (ImportError, OSError) as reason:
+        except (ImportError, OSError, RuntimeError) as reason:
             table.absent(f"{name}: {label}", reason)
             continue
         samples = 32

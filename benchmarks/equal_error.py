@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import statistics
 
-import numpy as np
 from meshes import load
 from numpy.typing import NDArray
 from peers import Mitsuba, MitsubaArrays, Open3D, Trimesh
@@ -22,9 +21,11 @@ def measure(table: Table, threads: int, quick: bool) -> None:
     table.heading(
         "Equal error", f"Seconds from mesh arrays to coefficients (order {ORDER}, building the scene included) to "
         f"rel L2 {ERROR:.0%} against a reference of 4096 rays a point and another seed. Ours: tolerance {ERROR}, "
-        "its error measured. Others: the plain estimator, whose error falls exactly as 1/sqrt(rays), measured at two "
-        "ray counts on the whole mesh and EXTRAPOLATED by that law; 'law' is the measured error of the smaller "
-        "count over the larger's, beside what the law says.")
+        "tightened until its true error is no more. Others: the plain estimator, whose error falls exactly as "
+        "1/sqrt(rays), measured at two ray counts on the whole mesh and EXTRAPOLATED by that law; 'law' is the "
+        "measured error of the smaller count over the larger's, beside what the law says. Mitsuba is measured "
+        "twice: its ray_test in the same NumPy program as the others', and all of the job in one compiled "
+        "kernel, as an expert would write it.")
     for label in ("8K",) if quick else ("8K", "35K"):
         name, mesh = load(label)
         reference = methods.run(methods.bake(mesh, order=ORDER, rays=4096, seed=99)).coefficients
@@ -47,7 +48,7 @@ def _equal_error(table: Table, name: str, mesh: TriangleMesh, reference: NDArray
     for peer in (Trimesh, Open3D, MitsubaArrays, Mitsuba):
         try:
             caster = peer(mesh, ORDER)
-        except (ImportError, OSError) as reason:
+        except (ImportError, OSError, RuntimeError) as reason:
             table.absent(f"{name}: {peer.name}", reason)
             continue
         caster.transfer(counts[1], 0)  # warm: compiles, touches memory
@@ -81,11 +82,10 @@ def measure_whole_job(table: Table, threads: int, quick: bool) -> None:
 
         try:
             found = Mitsuba(mesh, ORDER).transfer(rays, 1, cosine=True)
-        except (ImportError, OSError) as reason:
+        except (ImportError, OSError, RuntimeError) as reason:
             table.absent(f"{name}: {Mitsuba.name}", reason)
             continue
         same = rel_l2(found, methods.run(methods.bake(mesh, order=ORDER, rays=rays)).coefficients)
         a, b = interleaved(5, ours, peer)
-        table.add(f"{name}, {rays} rays (the two differ by {same:.1%})", f"{statistics.median(a):.0f} ns",
-                  f"{statistics.median(b):.0f} ns", ratio(b, a), 1)
-        assert np.isfinite(same)
+        table.add(f"{name}, {rays} rays (random directions there: the two differ by {same:.1%})",
+                  f"{statistics.median(a):.0f} ns", f"{statistics.median(b):.0f} ns", ratio(b, a), 1)
