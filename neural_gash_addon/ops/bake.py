@@ -181,7 +181,6 @@ class NEURAL_GASH_OT_bake_applied_copy(_Baking, bpy.types.Operator):
         self._selected = {obj.session_uid for obj in context.selected_objects}
         copy = make_applied_copy(context.object, context.evaluated_depsgraph_get())
         self._copy = copy.session_uid
-        context.view_layer.update()
         self._select(context, {copy.session_uid}, copy.session_uid)
         return copy
 
@@ -199,6 +198,7 @@ class NEURAL_GASH_OT_bake_applied_copy(_Baking, bpy.types.Operator):
     @staticmethod
     def _select(context: bpy.types.Context, selected: set[int], active: int) -> None:
         """Select the objects with these session uids, and no others."""
+        context.view_layer.update()  # what was made or removed just now
         for obj in context.view_layer.objects:
             obj.select_set(obj.session_uid in selected)
             if obj.session_uid == active:

@@ -42,7 +42,7 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
     mode = settings.occluder_mode() if method.traces else SELF
     if not mode:
         raise UserError("Choose the collection whose objects cast shadows.")
-    if mode in (SELF, VISIBLE) and settings.occluders == COLLECTION:
+    if method.traces and settings.occluders == COLLECTION and mode in (SELF, VISIBLE):
         raise UserError(f"A collection named '{mode}' cannot cast shadows, as the name has another meaning; "
                         "rename it.")
     occluders = read_occluders(obj, mode, depsgraph)
