@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 # make demo   bake a mesh, light it with an HDRI, render it; pictures go to out/
 # make test   run the tests
-.PHONY: demo test lint package bench clean
+.PHONY: demo docs-pictures test lint package bench clean
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 PY := .venv/bin/python
 
@@ -14,6 +14,9 @@ PY := .venv/bin/python
 
 demo: .venv/ready
 	$(PY) demo/demo.py
+
+docs-pictures: .venv/ready
+	$(PY) demo/demo.py --out docs
 
 test: .venv/ready
 	$(PY) -m pytest
