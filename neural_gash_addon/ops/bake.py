@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from typing import TYPE_CHECKING
 
 import bpy
 
@@ -47,6 +48,9 @@ class Worker(threading.Thread):
 
 class _Baking:
     """What the two Bake operators share. They differ in the object that is baked."""
+
+    if TYPE_CHECKING:  # the operator's own
+        def report(self, type: set[str], message: str) -> None: ...
 
     def _begin(self, context: bpy.types.Context) -> bpy.types.Object:
         """The object to bake. Raises UserError."""
