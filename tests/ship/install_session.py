@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Run by test_ship.py in a process of its own: install the zip, bake, disable; argv: zip, may the site's embreex serve."""
+"""Run by test_ship.py alone: install the zip, bake, disable. Arguments: zip; "bundled" where its wheel must serve."""
 import sys
 
 import bpy
@@ -35,7 +35,7 @@ bpy.ops.mesh.primitive_torus_add()
 bpy.ops.object.shade_smooth()
 bpy.context.scene.neural_gash.order = 4
 assert bpy.ops.neural_gash.bake() == {"FINISHED"}
-attributes = [name for name in bpy.context.object.data.attributes.keys() if name.startswith("_prt_")]
+attributes = [name for name, _ in bpy.context.object.data.attributes.items() if name.startswith("_prt_")]
 assert attributes == [f"_prt_{i}" for i in range(4)], attributes
 assert "embree" in bpy.context.object.data["neural_gash"]
 assert registered()
