@@ -29,8 +29,10 @@ def abandon() -> None:
 
 
 def redraw(context: bpy.types.Context) -> None:
-    """Have the panels drawn again."""
+    """Have the panels drawn again; not the views beside them, which may be heavy."""
     for window in context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
-                area.tag_redraw()
+                for region in area.regions:
+                    if region.type == "UI":
+                        region.tag_redraw()

@@ -54,6 +54,8 @@ class NEURAL_GASH_PT_main(_Panel, bpy.types.Panel):
         row = layout.row(align=True)
         row.operator("neural_gash.preview", icon="HIDE_OFF" if is_on(obj) else "HIDE_ON", depress=is_on(obj))
         row.operator("neural_gash.clear", icon="TRASH")
+        if is_on(obj) and context.space_data and context.space_data.shading.type in ("WIREFRAME", "SOLID"):
+            layout.label(text="See it in Material Preview", icon="INFO")
         if has_bake(obj):
             self._readout(layout.box(), obj)
 
