@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,9 @@ from .errors import UserError
 from .geometry import TriangleMesh
 from .record import BakeRecord
 from .transfer import Transfer
+
+# what NumPy raises at files that are missing, something else (.npy: TypeError), empty (EOFError) or damaged
+_UNREADABLE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
 def check_writable(path: Path) -> None:
@@ -68,6 +72,6 @@ def load_npz(path: Path) -> tuple[dict[str, NDArray], BakeRecord]:
         with np.load(path, allow_pickle=False) as data:
             arrays = {key: data[key] for key in ("positions", "normals", "transfer", "domain")}
             record = str(data["record"])
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except _UNREADABLE as error:
         raise UserError(f"'{path}' is missing or no bake that Neural GASh saved.") from error
     return arrays, BakeRecord.from_json(record)
