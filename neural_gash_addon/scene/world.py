@@ -69,7 +69,11 @@ def _background(world: bpy.types.World | None, order: int) -> Array:
     rotation = _mapping(world.name, colour)
     if colour.image is None:
         raise UserError(f"The Environment Texture of the World '{world.name}' has no image.")
-    image = sh_light.project_equirect(linear_pixels(colour.image), order)
+    try:
+        pixels = linear_pixels(colour.image)
+    except UserError as error:
+        raise UserError(f"The World '{world.name}' cannot be read as light: {error}") from error
+    image = sh_light.project_equirect(pixels, order)
     return strength * sh.rotate(image, rotation)
 
 
