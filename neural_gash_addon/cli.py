@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import asdict
 from pathlib import Path
 
@@ -19,10 +20,11 @@ from .backend import exchange, methods, shading
 from .backend import light as sh_light
 from .backend.errors import UserError
 from .ops.job import finish, prepare, summary
-from .properties import COLLECTION, RAYS, TOLERANCE
+from .properties import COLLECTION, RAYS, TOLERANCE, NeuralGashSettings
 from .scene import lighting
 from .scene.attributes import has_bake, read_record
 from .scene.preview import preview_on
+from .scene.read import make_applied_copy
 from .scene.render import render_preview
 from .scene.world import linear_pixels, rotated_light
 
@@ -56,7 +58,10 @@ def _parser() -> argparse.ArgumentParser:
                       help="what casts shadows on the object (self)")
     bake.add_argument("--out", metavar="OUT.blend", type=Path, help="save the file with the bake in it")
     bake.add_argument("--npz", metavar="OUT.npz", type=Path, help="save points and coefficients")
-    bake.add_argument("--png", metavar="OUT.png", type=Path, help="render the object as baked")
+    bake.add_argument("--png", metavar="OUT.png", type=Path,
+                      help="render the object as baked; the scene's camera where there is one (.exr: linear, 32 bits)")
+    bake.add_argument("--applied-copy", action="store_true",
+                      help="bake a copy with its modifiers applied, where those change the vertices")
     bake.add_argument("--json", action="store_true", help="print the record as one line of JSON")
 
     relight = commands.add_parser("relight", help="render or evaluate a baked file under another light",
@@ -66,7 +71,8 @@ def _parser() -> argparse.ArgumentParser:
     relight.add_argument("--hdri", metavar="FILE", type=Path, help="equirectangular image; else the file's World")
     relight.add_argument("--rotation", type=float, default=0.0, metavar="DEG", help="about the vertical axis (0)")
     relight.add_argument("--strength", type=float, default=1.0, help="factor on the light (1)")
-    relight.add_argument("--png", metavar="OUT.png", type=Path, help="render (a .blend only)")
+    relight.add_argument("--png", metavar="OUT.png", type=Path,
+                         help="render (a .blend only; .exr: linear, 32 bits)")
     relight.add_argument("--npz", metavar="OUT.npz", type=Path, help="save radiance (N, 3), albedo 1 (a .npz only)")
     relight.add_argument("--json", action="store_true", help="print a summary as one line of JSON")
     return parser
@@ -79,9 +85,7 @@ def main(argv: Sequence[str]) -> int:
     except SystemExit as end:  # argparse has said why
         return int(end.code or 0)
     try:
-        for output in (arguments.png, arguments.npz, getattr(arguments, "out", None)):
-            if output is not None:
-                exchange.check_writable(output.absolute())
+        _check_outputs(arguments)
         with _silent_blender():
             data, text = _COMMANDS[arguments.command](arguments)
         print(json.dumps(data, sort_keys=True) if arguments.json else text, flush=True)
@@ -96,23 +100,16 @@ def main(argv: Sequence[str]) -> int:
 
 def _bake(arguments: argparse.Namespace) -> tuple[dict, str]:
     """`bake`."""
-    if not (arguments.out or arguments.npz or arguments.png or arguments.json):
-        raise UserError("Nothing of this bake would be kept; add --out, --npz, --png or --json.")
-    if arguments.out and arguments.out.suffix != ".blend":
-        raise UserError("--out takes a .blend file.")
     _open(arguments.input)
     obj = _choose([o for o in bpy.context.scene.objects if o.type == "MESH"], arguments.object, "mesh")
     settings = bpy.context.scene.neural_gash
-    settings.method, settings.order = arguments.method, _in_range(arguments.order)
+    settings.method = arguments.method
+    _set(settings, "order", arguments.order)
     settings.quality = TOLERANCE if arguments.rays is None else RAYS
     if arguments.rays is not None:
-        settings.rays = max(arguments.rays, 0)
-        if settings.rays != arguments.rays:
-            raise UserError(f"The number of rays cannot be {arguments.rays}.")
+        _set(settings, "rays", arguments.rays)
     if arguments.tolerance is not None:
-        settings.tolerance = arguments.tolerance
-        if not math.isclose(settings.tolerance, arguments.tolerance, rel_tol=1e-5):
-            raise UserError(f"The tolerance must be {methods.MIN_TOLERANCE:g} to 1, not {arguments.tolerance:g}.")
+        _set(settings, "tolerance", arguments.tolerance)
     if arguments.occluders.upper() in ("SELF", "VISIBLE"):
         settings.occluders = arguments.occluders.upper()
     else:
@@ -120,6 +117,9 @@ def _bake(arguments: argparse.Namespace) -> tuple[dict, str]:
         settings.collection = bpy.data.collections.get(arguments.occluders)
         if settings.collection is None:
             raise UserError(f"There is no collection named '{arguments.occluders}' in the file.")
+    if arguments.applied_copy:
+        obj = make_applied_copy(obj, bpy.context.evaluated_depsgraph_get())
+        bpy.context.view_layer.update()
     job = prepare(bpy.context, obj, settings)
     transfer = methods.run(job.baking, _progress_bar())
     record, warning = finish(bpy.context, job, transfer)
@@ -137,6 +137,8 @@ def _bake(arguments: argparse.Namespace) -> tuple[dict, str]:
 def _relight(arguments: argparse.Namespace) -> tuple[dict, str]:
     """`relight`."""
     suffix = Path(arguments.input).suffix.lower()
+    if not math.isfinite(arguments.rotation) or not 0 <= arguments.strength < math.inf:
+        raise UserError("The rotation must be a number of degrees, and the strength one of 0 or more.")
     turn = (math.radians(arguments.rotation), arguments.strength)
     if suffix == ".npz":
         if arguments.png or arguments.object:
@@ -172,6 +174,19 @@ def _relight(arguments: argparse.Namespace) -> tuple[dict, str]:
     return {"object": name, "light": light.tolist()}, f"{name}: relit."
 
 
+def _check_outputs(arguments: argparse.Namespace) -> None:
+    """UserError, before anything is computed, where its outcome could not be kept."""
+    suffixes = {"out": (".blend",), "npz": (".npz",), "png": (".png", ".exr")}
+    outputs = {name: path for name in suffixes if (path := getattr(arguments, name, None)) is not None}
+    if not outputs and not arguments.json:
+        options = "--out, --npz, --png or --json" if arguments.command == "bake" else "--png, --npz or --json"
+        raise UserError(f"Nothing of this would be kept; add {options}.")
+    for name, path in outputs.items():
+        if path.suffix.lower() not in suffixes[name]:
+            raise UserError(f"--{name} writes {' or '.join(suffixes[name])} files, which '{path}' is not.")
+        exchange.check_writable(path.absolute())
+
+
 _COMMANDS = {"bake": _bake, "relight": _relight}
 
 
@@ -182,20 +197,27 @@ def _open(name: str) -> None:
         raise UserError(f"There is no file '{name}'.")
     suffix = path.suffix.lower()
     try:
-        if suffix == ".blend":
-            bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False)
-        elif suffix in _IMPORTERS:
-            bpy.ops.wm.read_homefile(use_factory_startup=True, use_empty=True)
-            _IMPORTERS[suffix](str(path))
-            world = bpy.data.worlds.new("Sky")  # a mesh file has no light; a white sky shows its shape
-            world.color = (1, 1, 1)
-            bpy.context.scene.world = world
-            if suffix == ".ply":
-                _shade_smooth()
-        else:
-            raise UserError(f"'{name}' is none of .blend, .obj, .ply, .glb, .stl.")
+        with redirect_stderr(io.StringIO()):  # importers in Python write tracebacks there
+            _read(name, path, suffix)
     except RuntimeError as error:
-        raise UserError(f"'{name}' cannot be read: {_first_line(error)}") from error
+        raise UserError(f"'{name}' cannot be read: {_reason(error)}.") from error
+
+
+def _read(name: str, path: Path, suffix: str) -> None:
+    """`_open` a file that is there; RuntimeError where Blender cannot."""
+    if suffix == ".blend":
+        bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False)
+    elif suffix in _IMPORTERS:
+        bpy.ops.wm.read_homefile(use_factory_startup=True, use_empty=True)
+        _IMPORTERS[suffix](str(path))
+        world = bpy.data.worlds.new("Sky")  # a mesh file has no light; a white sky shows its shape
+        world.color = (1, 1, 1)
+        bpy.context.scene.world = world
+        bpy.context.view_layer.objects.active = None  # the importer's choice, not a person's
+        if suffix == ".ply":
+            _shade_smooth()
+    else:
+        raise UserError(f"'{name}' is none of .blend, .obj, .ply, .glb, .stl.")
 
 
 def _shade_smooth() -> None:
@@ -223,10 +245,12 @@ def _choose(candidates: list[bpy.types.Object], name: str | None, kind: str) -> 
     raise UserError(f"The file has several {kind} objects; choose one with --object: {names}.")
 
 
-def _in_range(order: int) -> int:
-    if not methods.MIN_ORDER <= order <= methods.sh.MAX_ORDER:
-        raise UserError(f"The order must be {methods.MIN_ORDER} to {methods.sh.MAX_ORDER}, not {order}.")
-    return order
+def _set(settings: NeuralGashSettings, name: str, value: float) -> None:
+    """Set a number, which the property would silently clamp to its range."""
+    kind = settings.bl_rna.properties[name]
+    if not kind.hard_min <= value <= kind.hard_max * (1 + 1e-6):  # the ends of float ranges are rounded
+        raise UserError(f"The {kind.name.lower()} must be {kind.hard_min:g} to {kind.hard_max:g}, not {value:g}.")
+    setattr(settings, name, value)
 
 
 def _hdri_light(path: Path, order: int) -> np.ndarray:
@@ -236,7 +260,7 @@ def _hdri_light(path: Path, order: int) -> np.ndarray:
     try:
         image = bpy.data.images.load(str(path.absolute()))
     except RuntimeError as error:
-        raise UserError(f"The HDRI '{path}' cannot be read: {_first_line(error)}") from error
+        raise UserError(f"The HDRI '{path}' cannot be read: {_reason(error)}.") from error
     try:
         return sh_light.project_equirect(linear_pixels(image), order)
     finally:
@@ -250,7 +274,7 @@ def _save(path: Path) -> None:
         try:
             bpy.ops.wm.save_as_mainfile(filepath=str(draft), copy=True, check_existing=False)
         except RuntimeError as error:
-            raise UserError(f"'{path}' cannot be written: {_first_line(error)}") from error
+            raise UserError(f"'{path}' cannot be written: {_reason(error)}.") from error
 
 
 def _progress_bar() -> Callable[[float], None] | None:
@@ -280,9 +304,12 @@ def _silent_blender() -> Iterator[None]:
         os.close(nowhere)
 
 
-def _first_line(error: Exception) -> str:
-    """An operator's report without its 'Error: '."""
-    return str(error).strip().splitlines()[0].removeprefix("Error: ")
+def _reason(error: Exception) -> str:
+    """What an operator reported, in one line; of a traceback, the line that names the error."""
+    lines = str(error).strip().splitlines()
+    if any("Traceback" in line for line in lines):  # Blender adds a last line, of its own place
+        lines = [line for line in lines if not line.startswith((" ", "Location:"))][-1:]
+    return lines[0].strip().removeprefix("Error: ").rstrip(".")
 
 
 _command = None

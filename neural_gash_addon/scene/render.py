@@ -17,18 +17,24 @@ _LENS_ANGLE = 0.6  # radians, about a 58 mm lens
 
 
 def render_preview(objects: Sequence[bpy.types.Object], path: Path, *, camera: bpy.types.Object | None = None,
-                   direction: Sequence[float] = (0.6, -1.0, 0.45), resolution: tuple[int, int] = (800, 800),
+                   direction: Sequence[float] = (0.6, -1.0, 0.45), resolution: tuple[int, int] | None = None,
                    samples: int = 16) -> None:
     """Render objects alone, as they are shaded now, to a .png (sRGB, transparent around) or a 32-bit .exr.
 
     Args:
         camera: the view; one that frames the first object from `direction` (from the object
             towards the camera, world axes) where not given.
+        resolution: pixels (width, height); with a `camera`, those of the open scene where not
+            given, else 800 x 800.
     """
+    if resolution is None:
+        resolution = (800, 800) if camera is None else _resolution(bpy.context.scene.render)
+    hidden = [obj for obj in objects if obj.hide_render]
     scene = bpy.data.scenes.new("Neural GASh render")
     made: list[bpy.types.ID] = []
     try:
         for obj in objects:
+            obj.hide_render = False
             scene.collection.objects.link(obj)
         if camera is None:
             data = bpy.data.cameras.new("Neural GASh camera")
@@ -54,6 +60,8 @@ def render_preview(objects: Sequence[bpy.types.Object], path: Path, *, camera: b
             render.filepath = str(draft)
             bpy.ops.render.render(scene=scene.name, write_still=True)
     finally:
+        for obj in hidden:
+            obj.hide_render = True
         bpy.data.scenes.remove(scene)
         for item in made:
             (bpy.data.objects if isinstance(item, bpy.types.Object) else bpy.data.cameras).remove(item)
@@ -71,6 +79,12 @@ def render_pixels(objects: Sequence[bpy.types.Object], **view) -> NDArray[np.flo
         finally:
             bpy.data.images.remove(image)
     return pixels[::-1]
+
+
+def _resolution(render: bpy.types.RenderSettings) -> tuple[int, int]:
+    """Pixels (width, height) of a scene's renders."""
+    part = render.resolution_percentage / 100
+    return max(1, round(render.resolution_x * part)), max(1, round(render.resolution_y * part))
 
 
 def _frame(camera: bpy.types.Object, obj: bpy.types.Object, direction: Vector) -> None:
