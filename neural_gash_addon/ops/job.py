@@ -14,7 +14,7 @@ from ..backend.record import BakeRecord
 from ..backend.transfer import Transfer
 from ..properties import COLLECTION, RAYS, NeuralGashSettings
 from ..scene.attributes import write_transfer
-from ..scene.lighting import light_object, take_light
+from ..scene.lighting import apply_light, take_light
 from ..scene.preview import preview_off, preview_on
 from ..scene.read import SELF, VISIBLE, fingerprint, read_object, read_occluders, refusal, same_fingerprint
 
@@ -80,7 +80,7 @@ def finish(context: bpy.types.Context, job: Job, transfer: Transfer) -> tuple[Ba
     except UserError as error:
         preview_off(obj)
         warning = str(error)
-    light_object(context.scene, obj)
+    apply_light(context.scene)  # every preview: the World's light may be another now, and twins share the bake
     return record, warning
 
 

@@ -42,8 +42,10 @@ class NEURAL_GASH_OT_clear(bpy.types.Operator):
         return not reason
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Remove attributes, record and preview."""
-        preview_off(context.object)
+        """Remove attributes, record and the previews of every object that shares the mesh."""
+        for obj in bpy.data.objects:
+            if obj.data == context.object.data and not obj.library:
+                preview_off(obj)
         clear(context.object)
         return {"FINISHED"}
 
