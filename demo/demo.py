@@ -19,7 +19,7 @@ sys.path.insert(0, str(ROOT))
 import neural_gash_addon  # noqa: E402
 from neural_gash_addon.ops.job import summary  # noqa: E402
 from neural_gash_addon.scene.attributes import read_record  # noqa: E402
-from neural_gash_addon.scene.render import render_pixels  # noqa: E402
+from neural_gash_addon.scene.render import render_pixels, silent_blender  # noqa: E402
 
 HDRI = "courtyard.exr"
 VIEW = {"direction": (0.55, -1.0, 0.5), "resolution": (640, 520), "samples": 16}
@@ -87,12 +87,14 @@ def main() -> None:
 
     def bake(method: str) -> None:
         settings.method = method
-        bpy.ops.neural_gash.bake()
+        with silent_blender():
+            bpy.ops.neural_gash.bake()
         print(f"{method:9} {summary(read_record(obj))}.")
 
     def picture(rotation: float = 0.0) -> np.ndarray:
         settings.light_rotation = math.radians(rotation)
-        return render_pixels([obj], **VIEW)
+        with silent_blender():
+            return render_pixels([obj], **VIEW)
 
     bake("analytic")
     first = picture()

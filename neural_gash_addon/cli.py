@@ -6,10 +6,9 @@ import argparse
 import io
 import json
 import math
-import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr
 from dataclasses import asdict
 from pathlib import Path
 
@@ -25,7 +24,7 @@ from .scene import lighting
 from .scene.attributes import has_bake, read_record
 from .scene.preview import preview_on
 from .scene.read import make_applied_copy
-from .scene.render import render_preview
+from .scene.render import render_preview, silent_blender
 from .scene.world import linear_pixels, rotated_light
 
 OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -86,7 +85,7 @@ def main(argv: Sequence[str]) -> int:
         return int(end.code or 0)
     try:
         _check_outputs(arguments)
-        with _silent_blender():
+        with silent_blender():
             data, text = _COMMANDS[arguments.command](arguments)
         print(json.dumps(data, sort_keys=True) if arguments.json else text, flush=True)
     except UserError as error:
@@ -287,21 +286,6 @@ def _progress_bar() -> Callable[[float], None] | None:
         print(f"\rbaking [{'#' * round(40 * share):<40}] {100 * share:3.0f} %", end=end, file=sys.stderr, flush=True)
 
     return show
-
-
-@contextmanager
-def _silent_blender() -> Iterator[None]:
-    """Keep what Blender itself writes to standard output off it: that is for the report."""
-    sys.stdout.flush()
-    saved, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    try:
-        yield
-    finally:
-        sys.stdout.flush()
-        os.dup2(saved, 1)
-        os.close(saved)
-        os.close(nowhere)
 
 
 def _reason(error: Exception) -> str:

@@ -2,8 +2,11 @@
 """A picture of one object's preview, without a window: Cycles on the CPU, in a scene of its own."""
 from __future__ import annotations
 
+import os
+import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import bpy
@@ -97,3 +100,18 @@ def _frame(camera: bpy.types.Object, obj: bpy.types.Object, direction: Vector) -
     camera.location = centre + direction * distance
     camera.rotation_euler = direction.to_track_quat("Z", "Y").to_euler()
     camera.data.clip_start, camera.data.clip_end = distance / 1000, distance * 10
+
+
+@contextmanager
+def silent_blender() -> Iterator[None]:
+    """Keep what Blender itself writes to standard output off it: that is for the report."""
+    sys.stdout.flush()
+    saved, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        os.dup2(saved, 1)
+        os.close(saved)
+        os.close(nowhere)
