@@ -85,7 +85,7 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
             raise UserError("Give either a number of rays or a tolerance.")
         if rays is not None and not 1 <= rays <= 16 * MAX_RAYS:
             raise UserError(f"The number of rays must be 1 to {16 * MAX_RAYS}, not {rays}.")
-        if tolerance is not None and not MIN_TOLERANCE <= tolerance <= 1:
+        if tolerance is not None and not MIN_TOLERANCE * (1 - 1e-6) <= tolerance <= 1:  # Blender keeps float32
             raise UserError(f"The tolerance must be {MIN_TOLERANCE:g} to 1, not {tolerance:g}.")
     return entry.bake(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed, threads=threads)
 

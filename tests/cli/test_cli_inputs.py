@@ -78,7 +78,6 @@ def test_tolerance_is_reached(ply, run):
     assert report["tolerance"] == pytest.approx(0.01) and 0 < report["error_estimate"] < 0.012
 
 
-@pytest.mark.xfail(reason="Blender's float32 of 0.0001 is below the 0.0001 that methods.bake compares it with")
 def test_smallest_tolerance_is_taken(ply, run):
     done = run("bake", ply, "--tolerance", "0.0001", "--json")
     assert done.returncode == 0, done.stderr
