@@ -2,6 +2,7 @@
 """A picture of one object's preview, without a window: Cycles on the CPU, in a scene of its own."""
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 import tempfile
@@ -105,13 +106,19 @@ def _frame(camera: bpy.types.Object, obj: bpy.types.Object, direction: Vector) -
 @contextmanager
 def silent_blender() -> Iterator[None]:
     """Keep what Blender itself writes to standard output off it: that is for the report."""
-    sys.stdout.flush()
+    _flush()
     saved, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     try:
         yield
     finally:
-        sys.stdout.flush()
+        _flush()
         os.dup2(saved, 1)
         os.close(saved)
         os.close(nowhere)
+
+
+def _flush() -> None:
+    """Let out what Python and C hold back for standard output, while it still goes where it should."""
+    sys.stdout.flush()
+    ctypes.CDLL("ucrtbase" if sys.platform == "win32" else None).fflush(None)
