@@ -75,7 +75,7 @@ def measure_whole_job(table: Table, threads: int, quick: bool) -> None:
 
         def ours(mesh: TriangleMesh = mesh) -> float:
             record = methods.run(methods.bake(mesh, order=ORDER, rays=rays, threads=threads)).record
-            return record.seconds / record.rays * 1e9
+            return record.seconds / (record.rays + record.probe_rays) * 1e9
 
         def peer(mesh: TriangleMesh = mesh) -> float:
             return seconds(lambda: Mitsuba(mesh, ORDER).transfer(rays, 1, cosine=True)) / len(mesh.points) / rays * 1e9

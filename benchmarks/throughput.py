@@ -62,7 +62,7 @@ def measure(table: Table, threads: int, quick: bool) -> None:
 
             def ours(mesh: TriangleMesh = mesh, rays: int = rays, commit: float = commit) -> float:
                 record = methods.run(methods.bake(mesh, order=ORDER, rays=rays, threads=threads)).record
-                return record.rays / (record.seconds - commit) / 1e6
+                return (record.rays + record.probe_rays) / (record.seconds - commit) / 1e6
 
             def bare(mesh: TriangleMesh = mesh, rays: int = rays, scene: Occluders = scene) -> float:
                 spent, traced = bare_seconds(mesh, scene, rays, threads)

@@ -41,25 +41,25 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     lit = lit[morton_order(mesh.points[lit])] if len(lit) else lit
     most = MAX_RAYS if rays is None else rays
     estimator = BlockedEstimator(mesh, scene, order, seed, most)
-    traced = 0
+    probes = 0
     error: float | None = 0.0
     with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
         scale = None
         if tolerance is not None and len(lit):
-            scale, traced = yield from _pilot(estimator, lit, order, pool, threads)
+            scale, probes = yield from _pilot(estimator, lit, order, pool, threads)
         for start in range(0, len(lit), BLOCK):
             block = lit[start:start + BLOCK]
             done, share = start / len(lit), len(block) / len(lit)
             work = _trace_block(estimator, block, order, rays, None if scale is None or tolerance is None
                                 else (tolerance * scale) ** 2, pool, threads)
             coefficients[block], rays_of_point[block] = yield from _scaled(work, 0.95 * done, 0.95 * share)
-        traced += int(rays_of_point.sum(dtype=np.int64))
         if len(lit):
             work_error = _measured_error(mesh, scene, order, seed, coefficients, rays_of_point, lit, pool, threads)
             error, extra = yield from _scaled(work_error, 0.95, 0.05)
-            traced += extra
+            probes += extra
     return Transfer(coefficients, BakeRecord(
-        method="embree", order=order, points=count, domain=mesh.domain, rays=traced, seed=seed,
+        method="embree", order=order, points=count, domain=mesh.domain, seed=seed,
+        rays=int(rays_of_point.sum(dtype=np.int64)), probe_rays=probes,
         seconds=time.perf_counter() - began, error_estimate=error, tolerance=tolerance))
 
 

@@ -21,10 +21,11 @@ class BakeRecord:
     order: int
     points: int
     domain: str                       # 'POINT' or 'CORNER'
-    rays: int                         # traced in all
+    rays: int                         # that the coefficients are made of
     seed: int
     seconds: float                    # arrays to coefficients, wall clock
     error_estimate: float | None      # rel L2, measured; None: nothing was sampled
+    probe_rays: int = 0               # traced besides, to measure the error and set the tolerance's scale
     tolerance: float | None = None    # rel L2 that was asked for; None: a ray count was
     occluders: str = "SELF"           # 'SELF', 'VISIBLE' or a collection's name
     fingerprint: str = ""             # of the shape and its occluders
