@@ -1,15 +1,20 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 # make demo   bake a mesh, light it with an HDRI, render it; pictures go to out/
 # make test   run the tests
-.PHONY: demo docs-pictures test lint package bench clean
+# make lint, package, bench, docs-pictures, clean: as they say
+.PHONY: demo docs-pictures test lint package bench clean system-packages
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 PY := .venv/bin/python
+# Debian's names of what bpy loads; EEVEE renders without a display through EGL and llvmpipe
+SYSTEM := libegl1 libgl1 libgl1-mesa-dri libx11-6 libxi6 libxxf86vm1 libxfixes3 libxrender1 libxkbcommon0 libsm6 libice6
 
 .venv/ready: requirements.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || \
 	  { echo "Neural GASh is developed with Python 3.11, which was not found; install it or set PYTHON=."; exit 1; }
 	$(PYTHON) -m venv .venv
 	$(PY) -m pip install --disable-pip-version-check -q -r requirements.txt
+	@$(PY) -c 'import bpy' || { echo "Blender's module did not start; on a bare Debian or Ubuntu it wants:" \
+	  "apt-get install $(SYSTEM)"; exit 1; }
 	touch $@
 
 demo: .venv/ready
@@ -33,4 +38,7 @@ bench: .venv/ready
 	$(PY) benchmarks/bench.py
 
 clean:
-	rm -rf .venv build dist out .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv .venv52 build dist out .pytest_cache .mypy_cache .ruff_cache
+
+system-packages:
+	@echo $(SYSTEM)

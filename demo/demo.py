@@ -28,7 +28,7 @@ BACKGROUND = 0.05  # grey behind the pictures, linear
 
 def build_mesh() -> bpy.types.Object:
     """Suzanne, with brow and ears that overhang, on a finely tessellated round floor: one smooth mesh."""
-    bpy.ops.mesh.primitive_monkey_add(location=(0, 0, 0.68), rotation=(math.radians(-30), 0, math.radians(20)))
+    bpy.ops.mesh.primitive_monkey_add(location=(0, 0, 0.585), rotation=(math.radians(-30), 0, math.radians(20)))
     monkey = bpy.context.object
     monkey.modifiers.new("Subdivision", "SUBSURF").levels = 2
     bpy.ops.object.modifier_apply(modifier="Subdivision")

@@ -94,8 +94,8 @@ class BlockedEstimator:
             # so that one matrix product makes the rays of many points in the layout Embree reads
             lift = np.einsum("cd,ja->cajd", np.eye(3), local).reshape(9, -1).astype(np.float32)
             harmonics = sh.evaluate(local, self._order)
-            for first in range(0, len(rows), size):
-                yield rows[first:first + size], (lift, harmonics)
+            for part in np.array_split(rows, -(-len(rows) // size)):  # even, so that no worker waits for a rest
+                yield part, (lift, harmonics)
 
     def _blocked_sums(self, points: NDArray, lift: NDArray, harmonics: NDArray) -> NDArray[np.float64]:
         """Worker: (n, K) sums of Y_k over the blocked ones of these directions at these points."""

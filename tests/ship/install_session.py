@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Run by test_ship.py alone: install the zip, bake, disable. Arguments: zip; "bundled" where its wheel must serve."""
+"""Run by test_ship.py alone: install the zip, bake with the wheels in it, disable. Argument: the zip."""
+import importlib.util
 import sys
 
 import bpy
@@ -19,14 +20,29 @@ def registered() -> set[str]:
     return found
 
 
-before = registered()
-assert not before, before
+commands: list[object] = []  # Blender cannot list its commands: count ours as they come and go
+real_register, real_unregister = bpy.utils.register_cli_command, bpy.utils.unregister_cli_command
+
+
+def register_command(name, run):
+    commands.append(real_register(name, run))
+    return commands[-1]
+
+
+def unregister_command(handle):
+    real_unregister(handle)
+    commands.remove(handle)
+
+
+bpy.utils.register_cli_command, bpy.utils.unregister_cli_command = register_command, unregister_command
+assert not registered(), registered()
+assert importlib.util.find_spec("embreex") is None
 bpy.ops.extensions.package_install_files(filepath=sys.argv[1], repo="user_default", enable_on_install=True)
 assert ID in bpy.context.preferences.addons
-import embreex  # noqa: E402
-
-if sys.argv[2] == "bundled":
-    assert ".local" in embreex.__file__, embreex.__file__
+assert len(commands) == 1
+for name in ("embreex", "xatlas"):
+    bundled = importlib.import_module(name).__file__
+    assert bundled and ".local" in bundled, bundled
 
 bpy.ops.wm.read_homefile(use_factory_startup=True)
 bpy.ops.object.select_all(action="SELECT")
@@ -41,7 +57,7 @@ assert "embree" in bpy.context.object.data["neural_gash"]
 assert registered()
 
 bpy.ops.preferences.addon_disable(module=ID)
-assert not registered(), registered()
+assert not registered() and not commands, (registered(), commands)
 timers = [name for name in sys.modules if name.startswith(ID) and hasattr(sys.modules[name], "_compare_changed")
           and bpy.app.timers.is_registered(sys.modules[name]._compare_changed)]
 assert not timers, timers
