@@ -31,7 +31,7 @@ def register_command(name, run):
 
 def unregister_command(handle):
     real_unregister(handle)
-    commands.remove(handle)
+    commands[:] = [c for c in commands if c is not handle]  # Blender's own, registered before, go through here too
 
 
 bpy.utils.register_cli_command, bpy.utils.unregister_cli_command = register_command, unregister_command
