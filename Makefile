@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 # make demo   bake a mesh, light it with an HDRI, render it; pictures go to out/
 # make test   run the tests
+# make test-window BLENDER=…   try the panel and the bake in an open Blender (see tests/window/session.py)
 # make lint, package, bench, docs-pictures, clean: as they say
-.PHONY: demo docs-pictures test lint package bench clean system-packages
+.PHONY: demo docs-pictures test test-window lint package bench clean system-packages
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 PY := .venv/bin/python
 # Debian's names of what bpy loads; EEVEE renders without a display through EGL and llvmpipe
@@ -25,6 +26,14 @@ docs-pictures: .venv/ready
 
 test: .venv/ready
 	$(PY) -m pytest
+
+BLENDER ?= blender
+test-window:
+	@set -e; user=$$(mktemp -d); trap 'rm -rf "$$user"' EXIT; mkdir -p "$$user/extensions/user_default" out/window; \
+	cp -r neural_gash_addon "$$user/extensions/user_default/neural_gash"; \
+	sed -i.all '/^wheels = \[/,/^\]/d' "$$user/extensions/user_default/neural_gash/blender_manifest.toml"; \
+	BLENDER_USER_RESOURCES="$$user" $(BLENDER) --factory-startup --python-use-system-env --enable-event-simulate \
+	  --window-geometry 0 0 1280 800 --python-exit-code 1 --python tests/window/session.py -- "$(CURDIR)/out/window"
 
 lint: .venv/ready
 	.venv/bin/ruff check .

@@ -44,7 +44,7 @@ class NEURAL_GASH_PT_main(_Panel, bpy.types.Panel):
         obj = context.object
         if state.running:
             layout.progress(factor=state.progress, text=f"Baking: {100 * state.progress:.0f} %")
-            layout.label(text="Esc cancels", icon="EVENT_ESC")
+            layout.label(text="Esc cancels")
             return
         column = layout.column()
         column.scale_y = 1.6
