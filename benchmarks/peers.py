@@ -137,8 +137,8 @@ class Mitsuba:
         self.origins = self.mi.Point3f(origins(mesh).astype(np.float32).T)
         self.normals = self.mi.Normal3f(mesh.normals.astype(np.float32).T)
 
-    def transfer(self, rays: int, seed: int, cosine: bool = False) -> NDArray[np.float64]:
-        """Coefficients (N, K); `cosine` takes cosine-distributed directions instead of uniform ones."""
+    def transfer(self, rays: int, seed: int) -> NDArray[np.float64]:
+        """Coefficients (N, K) from uniform random directions."""
         import drjit as dr
 
         mi = self.mi
@@ -146,7 +146,6 @@ class Mitsuba:
         point = lane // self.LANES
         origin = dr.gather(mi.Point3f, self.origins, point)
         normal = dr.gather(mi.Normal3f, self.normals, point)
-        frame = mi.Frame3f(normal)
         random = mi.PCG32(size=self.count * self.LANES, initstate=seed)
         sums = [mi.Float(0) for _ in range(self.order ** 2)]
         steps = mi.UInt32(max(1, rays // self.LANES))
@@ -154,16 +153,12 @@ class Mitsuba:
         def step(i, random, sums):
             # no dr.maximum and no warp that uses it: LLVM before 17 aborts the process at its fmaximum
             u = random.next_float32()
-            z = dr.sqrt(1 - u) if cosine else 1 - 2 * u
-            s = dr.sqrt(u) if cosine else 2 * dr.sqrt(u * (1 - u))
+            z = 1 - 2 * u
+            s = 2 * dr.sqrt(u * (1 - u))
             sine, cos = dr.sincos(2 * dr.pi * random.next_float32())
             direction = mi.Vector3f(s * cos, s * sine, z)
-            weight = mi.Float(1)
-            if cosine:
-                direction = frame.to_world(direction)
-            else:
-                weight = dr.dot(direction, normal)
-                weight = dr.select(weight > 0, 4 * weight, 0)
+            weight = dr.dot(direction, normal)
+            weight = dr.select(weight > 0, 4 * weight, 0)
             weight = dr.select(self.scene.ray_test(mi.Ray3f(origin, direction)), 0, weight)
             values = dr.sh_eval(direction, self.order - 1)
             return i + 1, random, [a + weight * y for a, y in zip(sums, values, strict=True)]
