@@ -10,6 +10,11 @@ from .errors import UserError
 SCHEMA = 1
 VERSION = "0.1.0"
 BASIS = "real orthonormal SH, no Condon-Shortley phase, k = l*(l+1)+m; radiance = albedo * (T . L)"
+_DAMAGED = "The record of this bake is damaged; bake again."
+# what JSON may hold for each kind of field
+_KINDS: dict[str, tuple[type, ...]] = {
+    "str": (str,), "int": (int,), "float": (int, float), "float | None": (int, float, type(None)),
+    "tuple[float, ...]": (list,)}
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -56,12 +61,16 @@ class BakeRecord:
         if schema > SCHEMA:
             raise UserError(f"This bake was made by a newer Neural GASh ({data.get('version', 'unknown')}); "
                             "update the add-on to use it.")
-        known = {f.name for f in fields(BakeRecord)}
+        known = {f.name: f.type for f in fields(BakeRecord)}
+        values = {key: value for key, value in data.items() if key in known}
+        if not all(isinstance(value, _KINDS[str(known[key])]) for key, value in values.items()):
+            raise UserError(_DAMAGED)
         try:
-            record = BakeRecord(**{key: value for key, value in data.items() if key in known})
-        except TypeError as error:
-            raise UserError("The record of this bake is incomplete; bake again.") from error
-        if len(record.frame) != 9 or not 1 <= record.order <= 16:
-            raise UserError("The record of this bake is damaged; bake again.")
-        object.__setattr__(record, "frame", tuple(float(v) for v in record.frame))
+            record = BakeRecord(**values)
+            frame = tuple(float(v) for v in record.frame)
+        except (TypeError, ValueError) as error:
+            raise UserError(_DAMAGED) from error
+        if len(frame) != 9 or not 1 <= record.order <= 16:
+            raise UserError(_DAMAGED)
+        object.__setattr__(record, "frame", frame)
         return record

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What the bake promises beyond the numbers: its error, its limits, being stopped, the table."""
+import json
 import threading
 
 import numpy as np
@@ -179,3 +180,12 @@ def test_record_tells_what_was_done(torus):
     for text in ("", "{}", "[1]", '{"schema": 1}', "null"):
         with pytest.raises(UserError):
             type(record).from_json(text)
+
+
+@pytest.mark.parametrize(("field", "value"), [
+    ("order", "3"), ("order", 0), ("order", None), ("frame", "abcdefghi"), ("frame", [1, 0]), ("frame", ["x"] * 9),
+    ("rays", [4]), ("domain", 2), ("seconds", "long"), ("error_estimate", "none")])
+def test_record_that_was_edited_is_refused(torus, field, value):
+    record = bake(torus, rays=4).record
+    with pytest.raises(UserError, match="damaged"):
+        type(record).from_json(json.dumps({**json.loads(record.to_json()), field: value}))
