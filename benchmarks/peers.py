@@ -27,7 +27,7 @@ def origins(mesh: TriangleMesh) -> NDArray[np.float64]:
     Kept from the first call, so that no peer's time has ours in it.
     """
     scene = Occluders([(mesh.positions, mesh.triangles)], mesh.resolution)
-    return scene.origins(mesh.points, mesh.normals, mesh.insets) / scene.scale + scene.centre
+    return scene.origins(mesh.points, mesh.clearance) / scene.scale + scene.centre
 
 
 class _Plain:

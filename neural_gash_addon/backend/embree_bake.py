@@ -29,11 +29,13 @@ Result = TypeVar("Result")
 
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
-         occluders: Sequence[Geometry], seed: int, threads: int | None) -> Generator[float, None, Transfer]:
+         occluders: Sequence[Geometry], seed: int, threads: int | None, scene: Occluders | None = None,
+         ) -> Generator[float, None, Transfer]:
     """Trace `mesh` against itself and `occluders`; arguments as `methods.bake`."""
     began = time.perf_counter()
     threads = threads or default_threads()
-    scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
+    if scene is None:
+        scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
     count = len(mesh.points)
     coefficients = np.zeros((count, sh.coefficient_count(order)), dtype=np.float32)
     rays_of_point = np.zeros(count, dtype=np.int32)

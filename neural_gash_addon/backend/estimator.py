@@ -38,7 +38,7 @@ class BlockedEstimator:
         self._occluders = occluders
         self._order = order
         self._sets = sampling.hemisphere_sets(SETS, rays, int(rng.integers(2**31)))
-        self._origins = occluders.origins(mesh.points, mesh.normals, mesh.insets)
+        self._origins = occluders.origins(mesh.points, mesh.clearance)
         self._normals = mesh.normals
         self._angles = rng.uniform(0, 2 * np.pi, len(mesh.points)).astype(np.float32)
         self._set_of_point = rng.integers(0, SETS, len(mesh.points), dtype=np.uint8)

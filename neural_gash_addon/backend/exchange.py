@@ -30,8 +30,12 @@ def check_writable(path: Path) -> None:
         with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise UserError(f"The folder '{path.parent}' cannot be written to ({reason.lower()}).") from error
+        raise UserError(f"The folder '{path.parent}' cannot be written to ({reason(error)}).") from error
+
+
+def reason(error: OSError) -> str:
+    """Why a file could not be read or written, for the end of a sentence."""
+    return (error.strerror or str(error)).lower()
 
 
 @contextmanager

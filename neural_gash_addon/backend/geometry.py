@@ -14,13 +14,42 @@ from numpy.typing import NDArray
 
 from .errors import UserError
 
-POINT, CORNER = "POINT", "CORNER"
+POINT, CORNER, TEXEL = "POINT", "CORNER", "TEXEL"
 NO_FACES = "The mesh has no faces, so there is nothing to bake."
 NOT_FINITE = "The mesh has coordinates that are infinite or not numbers."
 
 # Corner normals of one vertex closer than this are one normal: above float32 noise of averaged
 # normals, below any split that can be seen (0.06 degrees).
 SAME_NORMAL = 1e-3
+# Rays start this many times as far inside the point's own faces as they start off the surface.
+INSET = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A mesh in the bake frame (world axes, metres) as it is shaded; points of either target come from it."""
+
+    positions: NDArray[np.float64]       # (V, 3)
+    corner_vertices: NDArray[np.int32]   # (C,) vertex of each face corner
+    corner_normals: NDArray[np.float32]  # (C, 3) shading normals
+    corner_faces: NDArray[np.int32]      # (C,) polygon of each face corner, non-decreasing
+    corners: NDArray[np.int32]           # (F, 3) face corners that make each triangle
+    resolution: float                    # spacing of the coordinates' floats, metres
+
+    @property
+    def triangles(self) -> NDArray[np.int32]:
+        """(F, 3) vertices of each triangle."""
+        return self.corner_vertices[self.corners]
+
+    @property
+    def polygons(self) -> NDArray[np.int32]:
+        """(F,) polygon of each triangle."""
+        return self.corner_faces[self.corners[:, 0]]
+
+    def vertex_points(self) -> TriangleMesh:
+        """Points at the vertices, or at the corners where normals split. Raises UserError as `from_corners`."""
+        return TriangleMesh.from_corners(self.positions, self.triangles, self.corner_vertices, self.corner_normals,
+                                         self.corner_faces, self.resolution)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +60,9 @@ class TriangleMesh:
     triangles: NDArray[np.int32]    # (F, 3)
     points: NDArray[np.float64]     # (N, 3)
     normals: NDArray[np.float64]    # (N, 3) unit shading normals; zero where there is none
-    insets: NDArray[np.float64]     # (N, 3) tangent direction (at most unit) into the point's own faces
-    elements: NDArray[np.int32]     # (E,) point of each vertex (POINT) or face corner (CORNER)
-    domain: str                     # POINT or CORNER, Blender's attribute domains
+    clearance: NDArray[np.float64]  # (N, 3) from each point to where its rays start, in Occluders' offsets
+    elements: NDArray[np.int32]     # (E,) point of each vertex (POINT), face corner (CORNER) or texel (TEXEL)
+    domain: str                     # POINT or CORNER, Blender's attribute domains; or TEXEL
     resolution: float               # spacing of the coordinates' floats, metres
 
     @staticmethod
@@ -61,17 +90,17 @@ class TriangleMesh:
             resolution = float(np.spacing(np.float32(np.abs(positions).max())))
         vertex_normals = np.zeros_like(positions)
         vertex_normals[corner_vertices] = corner_normals  # any one corner's, to compare the others with
-        vertex_normals = _unit(vertex_normals)
-        split = any(np.abs(_unit(corner_normals[s]) - vertex_normals[corner_vertices[s]]).max() > SAME_NORMAL
+        vertex_normals = unit(vertex_normals)
+        split = any(np.abs(unit(corner_normals[s]) - vertex_normals[corner_vertices[s]]).max() > SAME_NORMAL
                     for s in _blocks(len(corner_vertices)))
         if not split:
             count = len(positions)
-            return TriangleMesh(positions, triangles, positions, vertex_normals, np.zeros((count, 3)),
+            return TriangleMesh(positions, triangles, positions, vertex_normals, vertex_normals,
                                 np.arange(count, dtype=np.int32), POINT, resolution)
         first, elements = _distinct(corner_vertices, corner_normals)
-        point_vertices, normals = corner_vertices[first], _unit(corner_normals[first])
+        point_vertices, normals = corner_vertices[first], unit(corner_normals[first])
         insets = _insets(positions, corner_vertices, corner_faces, elements, normals)
-        return TriangleMesh(positions, triangles, positions[point_vertices], normals, insets,
+        return TriangleMesh(positions, triangles, positions[point_vertices], normals, normals + INSET * insets,
                             elements, CORNER, resolution)
 
     @staticmethod
@@ -84,19 +113,19 @@ class TriangleMesh:
         if not np.isfinite(positions).all():
             raise UserError(NOT_FINITE)
         corners = positions[triangles]                                   # (F, 3, 3)
-        face_normals = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+        face_normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
         corner_normals = np.repeat(face_normals, 3, axis=0)
         if smooth:
-            following = _unit(np.roll(corners, -1, 1) - corners)
+            following = unit(np.roll(corners, -1, 1) - corners)
             angles = np.arccos(np.clip(-(following * np.roll(following, 1, 1)).sum(-1), -1, 1))
             vertex_normals = np.zeros_like(positions)
             np.add.at(vertex_normals, triangles.ravel(), corner_normals * angles.reshape(-1, 1))
-            corner_normals = _unit(vertex_normals)[triangles.ravel()]
+            corner_normals = unit(vertex_normals)[triangles.ravel()]
         faces = np.repeat(np.arange(len(triangles)), 3)
         return TriangleMesh.from_corners(positions, triangles, triangles.ravel(), corner_normals, faces)
 
 
-def _unit(vectors: NDArray) -> NDArray[np.float64]:
+def unit(vectors: NDArray) -> NDArray[np.float64]:
     """Vectors (..., 3) scaled to length 1; zero where they are zero or not finite."""
     v = np.asarray(vectors, dtype=np.float64)
     length = np.linalg.norm(v, axis=-1, keepdims=True)
@@ -119,7 +148,7 @@ def _distinct(corner_vertices: NDArray, corner_normals: NDArray) -> tuple[NDArra
     steps = round(1 / SAME_NORMAL)
     side = 2 * steps + 1
     for s in _blocks(len(key)):
-        cells = np.rint(_unit(corner_normals[s]) * steps).astype(np.int64) + steps
+        cells = np.rint(unit(corner_normals[s]) * steps).astype(np.int64) + steps
         key[s] = (cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]
     order = np.lexsort((key, corner_vertices))
     v, k = corner_vertices[order], key[order]
@@ -141,7 +170,7 @@ def _insets(positions: NDArray, corner_vertices: NDArray, corner_faces: NDArray,
     centres = np.stack([np.bincount(face, positions[corner_vertices, a]) for a in range(3)], 1) / size[:, None]
     mean = np.zeros_like(point_normals)
     for s in _blocks(len(elements)):
-        towards = _unit(centres[face[s]] - positions[corner_vertices[s]])
+        towards = unit(centres[face[s]] - positions[corner_vertices[s]])
         np.add.at(mean, elements[s], towards)
     mean -= (mean * point_normals).sum(1, keepdims=True) * point_normals
-    return _unit(mean)
+    return unit(mean)

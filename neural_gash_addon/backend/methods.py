@@ -13,7 +13,7 @@ from . import spherical_harmonics as sh
 from .errors import UserError
 from .estimator import MAX_RAYS
 from .geometry import TriangleMesh
-from .raycast import Geometry
+from .raycast import Geometry, Occluders
 from .record import BakeRecord
 from .transfer import Transfer
 
@@ -34,7 +34,7 @@ class Method:
 
 
 def _analytic(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
-              occluders: Sequence[Geometry], seed: int, threads: int | None) -> Baking:
+              occluders: Sequence[Geometry], seed: int, threads: int | None, scene: Occluders | None = None) -> Baking:
     """Unshadowed transfer, exact; only `mesh` and `order` matter."""
     began = time.perf_counter()
     coefficients = np.empty((len(mesh.points), sh.coefficient_count(order)), dtype=np.float32)
@@ -57,7 +57,7 @@ METHODS: dict[str, Method] = {m.name: m for m in (
 
 def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: int | None = None,
          tolerance: float | None = None, occluders: Sequence[Geometry] = (), seed: int = 0,
-         threads: int | None = None) -> Baking:
+         threads: int | None = None, scene: Occluders | None = None) -> Baking:
     """Bake the transfer of a mesh's points.
 
     Args:
@@ -67,6 +67,7 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
         tolerance: relative L2 error to reach with as few rays as that takes (at most MAX_RAYS a
             point). A method that traces wants exactly one of the two.
         occluders: what else blocks, parts (positions (V, 3), triangles (F, 3)) in the same frame.
+        scene: mesh and occluders in Embree, where they are there already from another bake.
         seed: independent seeds give independent errors. threads: one a core where not given.
     Yields:
         Progress, 0 to 1, many times a second. `close()` stops the workers.
@@ -87,7 +88,8 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
             raise UserError(f"The number of rays must be 1 to {16 * MAX_RAYS}, not {rays}.")
         if tolerance is not None and not MIN_TOLERANCE * (1 - 1e-6) <= tolerance <= 1:  # Blender keeps float32
             raise UserError(f"The tolerance must be {MIN_TOLERANCE:g} to 1, not {tolerance:g}.")
-    return entry.bake(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed, threads=threads)
+    return entry.bake(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed, threads=threads,
+                      scene=scene)
 
 
 def run(baking: Baking, progress: Callable[[float], None] | None = None) -> Transfer:

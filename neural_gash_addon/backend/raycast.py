@@ -52,10 +52,10 @@ class Occluders:
         """World positions (N, 3) in the scene's own coordinates."""
         return np.ascontiguousarray((positions - self.centre) * self.scale, dtype=np.float32)
 
-    def origins(self, points: NDArray, normals: NDArray, insets: NDArray) -> NDArray[np.float32]:
-        """Where rays start: off the surface along the normal, and off the neighbours' planes along the inset."""
+    def origins(self, points: NDArray, clearance: NDArray) -> NDArray[np.float32]:
+        """Where rays from points (N, 3) start: `clearance` (N, 3) offsets away."""
         local = (points - self.centre) * self.scale
-        return (local + self.offset * (normals + 4.0 * insets)).astype(np.float32)
+        return (local + self.offset * clearance).astype(np.float32)
 
     def blocked(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.int32]:
         """0 where a ray is blocked, -1 where it is free. Both (R, 3) float32, contiguous. Releases the GIL."""

@@ -35,7 +35,9 @@ class BakeRecord:
     occluders: str = "SELF"           # 'SELF', 'VISIBLE' or a collection's name
     fingerprint: str = ""             # of the shape and its occluders
     frame: tuple[float, ...] = IDENTITY  # (9,) row-major rotation of the object at bake time
-    target: str = "vertices"
+    target: str = "vertices"          # or 'texture'
+    side: int = 0                     # texels a side of a texture
+    uv_map: str = ""                  # whose coordinates the texture has
     bounces: int = 0
     basis: str = BASIS
     version: str = VERSION

@@ -39,4 +39,4 @@ def at_points(geometry: Arrays, points: np.ndarray, normals: np.ndarray) -> Tria
     """The geometry with points of one's own choosing on it."""
     points, normals = np.atleast_2d(points).astype(float), np.atleast_2d(normals).astype(float)
     return TriangleMesh(np.asarray(geometry[0], float), np.asarray(geometry[1], np.int32), points, normals,
-                        np.zeros_like(points), np.arange(len(points), dtype=np.int32), POINT, 0.0)
+                        normals, np.arange(len(points), dtype=np.int32), POINT, 0.0)

@@ -2,7 +2,7 @@
 """What a point is: vertices under smooth shading, distinct (vertex, normal) pairs under split."""
 import numpy as np
 
-from neural_gash_addon.backend.geometry import CORNER, POINT, TriangleMesh
+from neural_gash_addon.backend.geometry import CORNER, INSET, POINT, TriangleMesh
 
 from . import shapes
 
@@ -42,9 +42,10 @@ def test_one_sharp_edge_splits_only_its_vertices():
     assert mesh.domain == CORNER and len(mesh.points) == 25 + 5
     on_fold = np.isclose(mesh.points[:, 0], 0.5)
     flat = mesh.normals[:, 2] > 0.99
-    assert (mesh.insets[on_fold & flat] @ [1, 0, 0] < -0.5).all()   # each into its own side
-    assert (mesh.insets[on_fold & ~flat] @ [1, 0, 1] > 0.5).all()
-    np.testing.assert_allclose((mesh.insets * mesh.normals).sum(1), 0, atol=1e-12)
+    insets = (mesh.clearance - mesh.normals) / INSET
+    assert (insets[on_fold & flat] @ [1, 0, 0] < -0.5).all()   # each into its own side
+    assert (insets[on_fold & ~flat] @ [1, 0, 1] > 0.5).all()
+    np.testing.assert_allclose((insets * mesh.normals).sum(1), 0, atol=1e-12)
 
 
 def test_noise_in_normals_does_not_split():

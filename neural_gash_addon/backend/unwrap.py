@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""UVs of a mesh's own for a bake, by xatlas: every face has a place that no other face has.
+
+xatlas takes time that grows faster than its charts, rasters each chart at the size of the atlas
+even where that is not the last packing, and holds the interpreter's lock meanwhile. So the mesh is cut
+into pieces of neighbouring faces; xatlas charts each by itself, at a tiny resolution, and packs all
+charts together once the pieces are done. On 18,000 triangles that takes a fifth of the time at the
+default options, and a window gets its turn between the pieces.
+"""
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import UserError
+from .estimator import morton_order
+from .geometry import Surface, unit
+
+PIECE = 1000           # triangles that xatlas charts at a time: 40 ms at most
+_DRAFT_RESOLUTION = 16  # of a piece's own packing, which is thrown away
+_FILLED = 0.65         # of the texture, at the first try of packing
+_BESIDE = 1.5          # texels that a chart takes beside its area and padding, each way
+_SHRINK = 0.94         # of the texels a metre, from one try to the next
+_TRIES = 16
+_FLAT = 1e-10          # of a face's area that is left in UVs: less, and it has collapsed
+
+
+@dataclass(frozen=True, eq=False)
+class Atlas:
+    """UVs, and what it took to get them."""
+
+    uv: NDArray[np.float64]  # (C, 2) of each face corner, 0 to 1
+    side: int                # texels a side
+    charts: int
+    single_faces: int        # faces that were laid out alone, as xatlas could not chart them
+
+
+def unwrap(surface: Surface, *, side: int | None, texels_per_metre: float | None = None, padding: int = 2,
+           ) -> Generator[float, None, Atlas]:
+    """Lay out the faces of a mesh in a square texture, without overlaps.
+
+    Seams follow where normals split; the triangles of a polygon stay together.
+
+    Args:
+        side: texels a side, or None and texels_per_metre, which decides it.
+        padding: texels between charts.
+    Yields:
+        Progress, 0 to 1.
+    Raises:
+        UserError: xatlas is not installed, or the texture is too small for its charts.
+    """
+    try:
+        import xatlas
+    except ImportError as error:
+        raise UserError("Textures need the Python package xatlas, which this Blender's Python has not; "
+                        "bake to vertices, or to a UV map of your own.") from error
+    positions, triangles, corners = surface.positions, surface.triangles, surface.corners
+    normals, polygons = surface.corner_normals, surface.polygons
+    local = np.zeros((len(triangles), 3, 2))  # metres, each piece in a plane of its own
+    pieces = _pieces(positions, triangles, polygons)
+    areas: list[float] = []  # of the charts, square metres
+    for number, piece in enumerate(pieces):
+        local[piece], found = _chart(xatlas, positions, triangles[piece], normals[corners[piece]])
+        areas += found
+        yield 0.8 * (number + 1) / len(pieces)
+    alone = _torn(local, positions, triangles, corners, polygons)
+    if alone.any():
+        local[alone] = _laid_flat(positions[triangles[alone]], polygons[alone])
+        pieces = [kept for piece in pieces if len(kept := piece[~alone[piece]])] + [np.flatnonzero(alone)]
+    density = _density(np.array(areas), side, padding) if side else texels_per_metre or 1.0
+    uv, side, charts = yield from _pack(xatlas, local, pieces, side, density, padding)
+    of_corner = np.zeros((len(normals), 2))
+    of_corner[corners] = uv
+    return Atlas(of_corner, side, charts, len(np.unique(polygons[alone])))
+
+
+def _pieces(positions: NDArray, triangles: NDArray, polygons: NDArray) -> list[NDArray[np.int64]]:
+    """Triangles in groups of about PIECE that are near in space; none cuts a polygon."""
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(polygons) != 0]))
+    centres = positions[triangles].mean(1)[starts]
+    order = morton_order(centres)
+    sizes = np.diff(np.concatenate([starts, [len(triangles)]]))[order]
+    number = (np.cumsum(sizes) - 1) // PIECE
+    piece_of_polygon = np.empty(len(starts), np.int64)
+    piece_of_polygon[order] = number
+    piece = np.repeat(piece_of_polygon, np.diff(np.concatenate([starts, [len(triangles)]])))
+    by_piece = np.argsort(piece, kind="stable")
+    return np.split(by_piece, np.flatnonzero(np.diff(piece[by_piece])) + 1)
+
+
+def _chart(xatlas, positions: NDArray, triangles: NDArray, normals: NDArray) -> tuple[NDArray, list[float]]:
+    """(f, 3, 2) UVs of some triangles in metres, from charts of theirs alone, and the area of each chart."""
+    keys = np.concatenate([triangles.reshape(-1, 1), np.rint(1000 * normals.reshape(-1, 3)).astype(np.int64)], 1)
+    _, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    vertices = positions[triangles.ravel()[first]]
+    size = float(np.ptp(vertices, axis=0).max()) or 1.0  # xatlas's tolerances are absolute
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(((vertices - vertices.min(0)) / size).astype(np.float32), index.reshape(-1, 3).astype(np.uint32),
+                   normals.reshape(-1, 3)[first].astype(np.float32))
+    pack = xatlas.PackOptions()
+    pack.resolution, pack.bilinear, pack.rotate_charts = _DRAFT_RESOLUTION, False, False
+    atlas.generate(xatlas.ChartOptions(), pack)
+    _, indices, uv = atlas.get_mesh(0)
+    flat = (uv * np.array([atlas.width, atlas.height]))[indices].astype(np.float64)
+    points = positions[triangles]
+    areas = []
+    for number in range(atlas.get_mesh_chart_count(0)):
+        faces = np.asarray(atlas.get_mesh_chart(0, number).faces)
+        flat[faces] *= _metres(points[faces], flat[faces])
+        areas.append(_area(flat[faces]))
+    return flat, areas
+
+
+def _area(uv: NDArray) -> float:
+    """Area of triangles (f, 3, 2)."""
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    return 0.5 * float(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
+
+
+def _density(areas: NDArray, side: int, padding: int) -> float:
+    """Texels a metre at which charts of these areas (n,) fill a texture, each a square with its padding."""
+    low, high = 0.0, side / max(float(areas.sum()) ** 0.5, 1e-300)
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        room = np.square(np.sqrt(areas / _FILLED) * middle + padding + _BESIDE).sum()
+        low, high = (middle, high) if room < side * side else (low, middle)
+    return max(low, 0.01 * high)
+
+
+def _metres(points: NDArray, flat: NDArray) -> NDArray[np.float64]:
+    """(2,) metres per unit of u and of v of a chart: xatlas rounds the size of its charts to whole texels.
+
+    Median over the area of how far a point of the mesh moves with u, and with v: slivers that collapsed
+    would outweigh a mean.
+    """
+    e, f = points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]
+    (a, b), (c, d) = (flat[:, 1] - flat[:, 0]).T, (flat[:, 2] - flat[:, 0]).T
+    det = a * d - b * c
+    weight = np.linalg.norm(np.cross(e, f), axis=1)
+    good = (np.abs(det) > _FLAT) & (weight > 0)
+    if not good.any():
+        return np.ones(2)
+    e, f, a, b, c, d, det, weight = e[good], f[good], a[good], b[good], c[good], d[good], det[good], weight[good]
+    along_u = (d[:, None] * e - b[:, None] * f) / det[:, None]
+    along_v = (a[:, None] * f - c[:, None] * e) / det[:, None]
+    return np.array([_median(np.linalg.norm(along, axis=1), weight) for along in (along_u, along_v)])
+
+
+def _median(values: NDArray, weights: NDArray) -> float:
+    """Weighted median of values (n,)."""
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
+
+
+def _torn(local: NDArray, positions: NDArray, triangles: NDArray, corners: NDArray, polygons: NDArray
+          ) -> NDArray[np.bool_]:
+    """(F,) triangles of polygons that were collapsed, or cut by a seam between their triangles."""
+    area = 0.5 * np.linalg.norm(np.cross(positions[triangles[:, 1]] - positions[triangles[:, 0]],
+                                         positions[triangles[:, 2]] - positions[triangles[:, 0]]), axis=1)
+    a, b = local[:, 1] - local[:, 0], local[:, 2] - local[:, 0]
+    flat = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    bad = (area > 0) & ~(flat > _FLAT * area)
+    one = np.zeros((int(corners.max()) + 1, 2))
+    one[corners] = local  # any one triangle's, to compare the others with
+    grain = 1e-6 * float(np.abs(local).max(initial=0.0)) + 1e-300
+    bad |= np.any(np.abs(one[corners] - local) > grain, axis=(1, 2))
+    torn = np.zeros(int(polygons.max()) + 1, bool)
+    torn[polygons[bad]] = True
+    return torn[polygons]
+
+
+def _laid_flat(points: NDArray, polygons: NDArray) -> NDArray[np.float64]:
+    """(f, 3, 2) UVs in metres of triangles (f, 3, 3): each polygon projected on its mean plane, all in a row."""
+    face = np.unique(polygons, return_inverse=True)[1]
+    cross = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+    normal = unit(np.stack([np.bincount(face, cross[:, axis]) for axis in range(3)], 1))
+    first = unit(np.cross(normal, np.eye(3)[np.abs(normal).argmin(1)]))
+    axes = np.stack([first, np.cross(normal, first)], 1)[face]       # (f, 2, 3)
+    flat = np.einsum("fcx,fax->fca", points - points.reshape(-1, 3).mean(0), axes)
+    low, high = np.full((len(normal), 2), np.inf), np.full((len(normal), 2), -np.inf)
+    np.minimum.at(low, face, flat.min(1))
+    np.maximum.at(high, face, flat.max(1))
+    width = high[:, 0] - low[:, 0]
+    row = np.cumsum(1.1 * width + 1e-3 * width.max()) - 1.1 * width
+    flat -= low[face][:, None]
+    flat[..., 0] += row[face][:, None]
+    return flat
+
+
+def _pack(xatlas, local: NDArray, pieces: list[NDArray[np.int64]], side: int | None, density: float, padding: int
+          ) -> Generator[float, None, tuple[NDArray, int, int]]:
+    """(F, 3, 2) UVs 0 to 1 of all charts in one texture, its side, and the number of charts."""
+    scaled = local * density  # in texels, as xatlas's tolerances are absolute
+    meshes = []
+    for piece in pieces:
+        places, index = np.unique(scaled[piece].reshape(-1, 2), axis=0, return_inverse=True)
+        meshes.append((places.astype(np.float32), index.reshape(-1, 3).astype(np.uint32)))
+    scale = 1.0
+    for number in range(_TRIES):
+        yield 0.85 + 0.15 * number / _TRIES
+        atlas = xatlas.Atlas()  # a new one: packing again would find the charts of the time before
+        for mesh in meshes:
+            atlas.add_uv_mesh(*mesh)
+        pack = xatlas.PackOptions()
+        pack.padding, pack.texels_per_unit, pack.resolution = padding, scale, side or 0
+        atlas.generate(xatlas.ChartOptions(), pack)
+        if side is None:
+            side = max(atlas.width, atlas.height)
+        if atlas.atlas_count == 1 and max(atlas.width, atlas.height) <= side:
+            break
+        scale *= min(_SHRINK, 1.3 / max(1, atlas.atlas_count) ** 0.5)
+    else:
+        raise UserError(f"A texture of {side} x {side} is too small for the {atlas.chart_count:,} charts of this mesh; "
+                        "choose a higher resolution or a smaller padding.")
+    out = np.empty_like(local)
+    size = np.array([atlas.width, atlas.height]) / side
+    for number, piece in enumerate(pieces):
+        _, indices, uv = atlas.get_mesh(number)
+        out[piece] = (uv * size)[indices]
+    return out, side, int(atlas.chart_count)

@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Texture bakes: atlas, points of texels, seams, tiles that are resumed."""
+import json
+
+import numpy as np
+import pytest
+
+from neural_gash_addon.backend import methods, metrics, texture
+from neural_gash_addon.backend import spherical_harmonics as sh
+from neural_gash_addon.backend.errors import UserError
+from neural_gash_addon.backend.geometry import Surface, TriangleMesh
+from neural_gash_addon.backend.raster import Layout
+from neural_gash_addon.backend.texels import bilinear, texel_points
+from neural_gash_addon.backend.unwrap import unwrap
+
+from . import shapes
+
+
+def surface(geometry, smooth=True, quads=False):
+    """A mesh of triangles (or of pairs of them) as a Surface."""
+    positions, triangles = np.asarray(geometry[0], float), np.asarray(geometry[1], np.int32)
+    mesh = TriangleMesh.from_triangles(positions, triangles, smooth)
+    normals = mesh.normals[mesh.elements[triangles]] if mesh.domain == "POINT" else \
+        mesh.normals[mesh.elements].reshape(-1, 3, 3)
+    count = len(triangles)
+    return Surface(positions, triangles.ravel(), normals.reshape(-1, 3).astype(np.float32),
+                   np.repeat(np.arange(count, dtype=np.int32), 3),
+                   np.arange(3 * count, dtype=np.int32).reshape(-1, 3), 0.0)
+
+
+def atlas(mesh, side=128, **settings):
+    return methods.run(unwrap(mesh, side=side, **settings))
+
+
+def lookup(result, uv):
+    """Coefficients (n, K) at uv (n, 2), as a shader gets them."""
+    side, filled = result.record.side, result.fill_map()
+    images = [bilinear(result.image(i, filled).reshape(side, side, 4), uv)
+              for i in range(texture.image_count(result.record.order))]
+    return np.concatenate(images, 1)[:, :result.record.order ** 2]
+
+
+def surface_samples(mesh, uv, count=4000, seed=0, edges=False):
+    """Random points of the mesh: uv (n, 2) and unit normals (n, 3); on the triangles' edges if asked."""
+    rng = np.random.default_rng(seed)
+    weights = rng.dirichlet([1, 1, 1], count)
+    if edges:
+        weights[:, 2] = 0
+        weights /= weights.sum(1, keepdims=True)
+    corners = mesh.corners[rng.integers(0, len(mesh.corners), count)]
+    normals = np.einsum("nc,ncx->nx", weights, mesh.corner_normals[corners].astype(float))
+    return np.einsum("nc,ncx->nx", weights, uv[corners]), normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("geometry", [shapes.cube(), shapes.sphere(), shapes.torus()], ids=["cube", "sphere", "torus"])
+def test_atlas_gives_every_face_room_of_its_own(geometry):
+    mesh = surface(geometry)
+    found = atlas(mesh)
+    assert found.side == 128 and found.uv.min() >= 0 and found.uv.max() <= 1
+    uv = found.uv[mesh.corners]
+    assert not len(Layout(uv, mesh.triangles, 512).coverage().overlapping)
+    corners = mesh.positions[mesh.triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    density = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / area
+    assert np.percentile(density, 2) > 0.5 * np.median(density) and density.max() < 2 * np.median(density)
+    assert 0.35 < density @ area / 2 < 1   # well filled
+
+
+def test_polygons_are_not_torn():
+    positions, triangles = shapes.torus()
+    mesh = surface((positions, triangles))
+    # pairs of triangles that share two corners, as Blender's quads do
+    count = len(triangles) // 2 * 2
+    quads = [(a, b) for a, b in zip(range(0, count, 2), range(1, count, 2), strict=True)
+             if len(set(triangles[a]) & set(triangles[b])) == 2]
+    assert len(quads) > 50
+    faces, corners, vertices, normals = [], [], [], []
+    for number, (a, b) in enumerate(quads):
+        own = list(dict.fromkeys([*triangles[a], *triangles[b]]))
+        start = len(vertices)
+        vertices += own
+        corners += [[start + own.index(v) for v in triangles[t]] for t in (a, b)]
+        faces += [number] * len(own)
+        normals += [mesh.corner_normals[np.flatnonzero(triangles.ravel() == v)[0]] for v in own]
+    quad = Surface(positions, np.array(vertices), np.array(normals), np.array(faces), np.array(corners), 0.0)
+    found = atlas(quad, 256)
+    assert not len(Layout(found.uv[quad.corners], quad.triangles, 1024).coverage().overlapping)
+    uv = found.uv[quad.corners]
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    assert (np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 0).all()
+
+
+def test_texels_per_metre_decide_the_side():
+    mesh = surface(shapes.cube())
+    small, large = (methods.run(unwrap(mesh, side=None, texels_per_metre=d)) for d in (32, 64))
+    assert large.side == pytest.approx(2 * small.side, rel=0.15)
+    uv = large.uv[mesh.corners] * large.side
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    assert np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2 == pytest.approx(6 * 64 ** 2, rel=0.1)
+
+
+def test_too_small_a_texture_is_refused():
+    with pytest.raises(UserError, match="too small"):
+        atlas(surface(shapes.torus(), smooth=False), 16, padding=8)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_atlas_does_not_depend_on_scale(scale):
+    positions, triangles = shapes.torus()
+    near = atlas(surface((positions, triangles)))
+    far = atlas(surface((scale * positions, triangles)))
+    np.testing.assert_allclose(far.uv, near.uv, atol=0.02)
+
+
+def test_broken_faces_are_laid_out_without_a_crash():
+    positions, triangles = shapes.sphere(2)
+    positions = positions.copy()
+    positions[triangles[3]] = positions[triangles[3, 0]]              # a point
+    positions[triangles[9, 1]] = positions[triangles[9, 2]] + 1e-12   # a line
+    triangles = np.concatenate([triangles, triangles[:5], triangles[5:9, ::-1]])  # twice, and turned round
+    mesh = surface((positions, triangles))
+    found = atlas(mesh, 256)
+    assert np.isfinite(found.uv).all() and found.uv.min() >= 0 and found.uv.max() <= 1
+
+
+def test_convex_mesh_equals_the_analytic_coefficients_across_seams():
+    mesh = surface(shapes.sphere(3))
+    found = atlas(mesh, 256)
+    result = methods.run(texture.bake(mesh, found.uv, 256, "embree", 5, rays=64))
+    every = {}
+    for name, edges in (("inside", False), ("edges", True)):
+        uv, normals = surface_samples(mesh, found.uv, edges=edges)
+        every[name] = metrics.rel_l2(lookup(result, uv), sh.cosine_lobe(normals, 5))
+    uv = found.uv[mesh.corners]
+    starts = {}
+    for face, triangle in enumerate(mesh.triangles):
+        for edge in range(3):
+            pair = (triangle[edge], triangle[(edge + 1) % 3])
+            starts[pair] = (uv[face, edge], uv[face, (edge + 1) % 3])
+    on_seam = [pair for pair in starts if not np.allclose(starts[pair][0], starts[pair[::-1]][1])
+               or not np.allclose(starts[pair][1], starts[pair[::-1]][0])]
+    assert len(on_seam) > 10
+    share = np.random.default_rng(3).uniform(size=(len(on_seam), 1))
+    places = np.array([starts[p][0] for p in on_seam]) * (1 - share) + np.array([starts[p][1] for p in on_seam]) * share
+    vertex_normals = np.zeros_like(mesh.positions)
+    vertex_normals[mesh.corner_vertices] = mesh.corner_normals
+    ends = vertex_normals[np.array(on_seam)]
+    normals = ends[:, 0] * (1 - share) + ends[:, 1] * share
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    at_seam = metrics.rel_l2(lookup(result, places), sh.cosine_lobe(normals, 5))
+    assert every["inside"] < 0.01 and every["edges"] < 0.01
+    assert at_seam < 2 * every["inside"]
+
+
+def test_floor_under_a_box_has_its_shadow_and_none_where_it_is_open():
+    floor = (np.array([[-2., -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    box = shapes.cube()
+    occluder = (box[0] * 0.8 + [0, 0, 0.5], box[1])
+    mesh = surface(floor)
+    uv = (mesh.positions[mesh.corner_vertices][:, :2] + 2) / 4
+    result = methods.run(texture.bake(mesh, uv, 64, order=3, rays=256, occluders=[occluder]))
+    reference_points = np.array([[0.9, 0.1, 0], [1.4, -1.2, 0], [0.55, 0.5, 0], [-1.9, 1.9, 0]])
+    target = shapes.at_points(floor, reference_points, np.tile([0., 0, 1], (4, 1)))
+    truth = methods.run(methods.bake(target, order=3, rays=4096, seed=7, occluders=[occluder])).coefficients
+    found = lookup(result, (reference_points[:, :2] + 2) / 4)
+    np.testing.assert_allclose(found, truth, atol=0.02)
+    assert lookup(result, np.array([[0.5, 0.5]]))[0, 0] < 0.25 * sh.cosine_lobe(np.array([[0., 0, 1]]), 3)[0, 0]
+    open_floor = methods.run(texture.bake(mesh, uv, 64, order=3, rays=64))
+    np.testing.assert_allclose(lookup(open_floor, np.random.default_rng(0).uniform(size=(50, 2))),
+                               np.tile(sh.cosine_lobe(np.array([[0., 0, 1]]), 3), (50, 1)), atol=1e-6)
+
+
+def test_closed_box_lets_no_light_in():
+    mesh = surface(shapes.cube(inside=True), smooth=False)
+    found = atlas(mesh, 64)
+    result = methods.run(texture.bake(mesh, found.uv, 64, order=3, rays=64))
+    assert max(np.abs(c).max() for c in result.coefficients) < 1e-6
+
+
+def test_coarse_smooth_mesh_does_not_shadow_itself():
+    mesh = surface(shapes.sphere(1))
+    found = atlas(mesh, 64)
+    result = methods.run(texture.bake(mesh, found.uv, 64, order=3, rays=256))
+    coverage = Layout(found.uv[mesh.corners], mesh.triangles, 64).coverage()
+    exact = sh.cosine_lobe(texel_points(mesh, coverage).normals, 3)
+    assert metrics.rel_l2(np.concatenate(result.coefficients), exact) < 0.01
+
+
+def test_points_are_where_the_uv_map_says():
+    mesh = surface(shapes.torus())
+    found = atlas(mesh, 128)
+    uv = found.uv[mesh.corners]
+    coverage = Layout(uv, mesh.triangles, 128).coverage()
+    inside = np.abs(coverage.centres - coverage.barycentric).max(1) < 1e-9
+    places = np.einsum("nc,ncx->nx", coverage.barycentric, uv[coverage.faces])[inside] * 128
+    centres = np.stack([coverage.texels % 128, coverage.texels // 128], 1)[inside] + 0.5
+    np.testing.assert_allclose(places, centres, atol=1e-6)
+    points = texel_points(mesh, coverage)
+    np.testing.assert_allclose(np.linalg.norm(points.normals, axis=1), 1)
+    ring = np.hypot(points.points[:, 0], points.points[:, 1]) - 1
+    np.testing.assert_allclose(np.hypot(ring, points.points[:, 2]), 0.45, atol=0.02)
+
+
+class Stopped(Exception):
+    pass
+
+
+def test_a_bake_that_was_killed_goes_on_and_gives_the_same_bytes(tmp_path, monkeypatch):
+    monkeypatch.setattr(texture, "_TILE", 64 * 16)
+    mesh = surface(shapes.torus())
+    found = atlas(mesh, 64)
+    settings = {"order": 3, "tolerance": 0.05, "key": "a"}
+    whole = methods.run(texture.bake(mesh, found.uv, 64, **settings))
+    assert len(whole.texels) == 4
+    baking = texture.bake(mesh, found.uv, 64, folder=tmp_path / "tiles", **settings)
+    while len(list((tmp_path / "tiles").glob("*.json"))) < 4:   # the job's and three tiles'
+        next(baking)
+    baking.close()
+    torn = tmp_path / "tiles" / "0001.npy"
+    torn.write_bytes(torn.read_bytes()[:-100])   # half-written
+    traced = []
+    original = methods.bake
+    monkeypatch.setattr(methods, "bake", lambda *a, **k: traced.append(1) or original(*a, **k))
+    again = methods.run(texture.bake(mesh, found.uv, 64, folder=tmp_path / "tiles", **settings))
+    assert len(traced) == 2                       # the torn one, and the one that was missing
+    for a, b in zip(whole.coefficients, again.coefficients, strict=True):
+        assert a.tobytes() == np.asarray(b).tobytes()
+    assert again.record.rays == whole.record.rays and again.record.error_estimate == whole.record.error_estimate
+    methods.run(texture.bake(mesh, found.uv, 64, folder=tmp_path / "tiles", **{**settings, "key": "b"}))
+    assert len(traced) == 6                       # another bake: nothing of the first is taken
+    (tmp_path / "tiles" / "mine.txt").write_text("kept")
+    texture.remove_tiles(tmp_path / "tiles")
+    assert [p.name for p in (tmp_path / "tiles").iterdir()] == ["mine.txt"]
+
+
+def test_record_tells_of_the_texture():
+    mesh = surface(shapes.torus())
+    record = methods.run(texture.bake(mesh, atlas(mesh, 64).uv, 64, order=2, rays=16, seed=5)).record
+    assert (record.target, record.side, record.domain, record.order, record.seed) == ("texture", 64, "TEXEL", 2, 5)
+    assert record.rays == 16 * record.points and 0 < record.error_estimate < 0.2
+    assert json.loads(record.to_json())["side"] == 64
+
+
+def test_overlapping_faces_are_named():
+    mesh = surface(shapes.cube())
+    uv = atlas(mesh, 64).uv
+    uv[mesh.corners[4]] = uv[mesh.corners[9]]
+    with pytest.raises(UserError, match="4 and 9"):
+        methods.run(texture.bake(mesh, uv, 64, rays=4))
+
+
+@pytest.mark.parametrize("side", [0, 8, 10000])
+def test_sides_out_of_range_are_refused(side):
+    mesh = surface(shapes.cube())
+    with pytest.raises(UserError, match="resolution"):
+        methods.run(texture.bake(mesh, np.zeros((len(mesh.corner_vertices), 2)), side, rays=4))
+
+
+def test_uv_map_without_area_is_refused():
+    mesh = surface(shapes.cube())
+    with pytest.raises(UserError):
+        methods.run(texture.bake(mesh, np.full((len(mesh.corner_vertices), 2), 0.5), 32, rays=4))
