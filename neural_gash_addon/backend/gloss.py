@@ -88,7 +88,7 @@ def transferred(transfer: NDArray, light: NDArray, out: NDArray[np.float32] | No
         out = np.empty((count, coefficients, 3), dtype=np.float32)
     elif out.shape != (count, coefficients, 3) or out.dtype != np.float32 or not out.flags.c_contiguous:
         raise ValueError(f"out must be C-contiguous float32 of shape {(count, coefficients, 3)}")
-    flat = out.reshape(count, -1)
+    flat = out.reshape(count, 3 * coefficients)
     for start in range(0, count, _BLOCK):
         block = np.ascontiguousarray(transfer[start:start + _BLOCK], dtype=np.float32)
         target = flat[start:start + _BLOCK]
