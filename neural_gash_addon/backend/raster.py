@@ -30,7 +30,6 @@ class Coverage:
     faces: NDArray[np.int32]          # (n,) triangle
     barycentric: NDArray[np.float64]  # (n, 3) of the nearest point of the triangle to the texel's centre
     centres: NDArray[np.float64]      # (n, 3) of the centre itself: the same inside, beyond 0..1 in the border
-    overlapping: NDArray[np.int32]    # (m, 2) pairs of triangles that claim the same texel, each pair once
 
 
 class Layout:
@@ -58,12 +57,8 @@ class Layout:
         corners = self._corners[near]
         texels, faces = _centres_inside(corners, self.side, start, stop)
         order = np.lexsort((faces, texels))
-        texels, faces = texels[order], faces[order]
-        again = np.flatnonzero(texels[1:] == texels[:-1])
-        overlapping = np.unique(near[np.stack([faces[again], faces[again + 1]], 1)], axis=0)
-        first = np.ones(len(texels), bool)
-        first[again + 1] = False
-        texels, faces = texels[first], faces[first]
+        order = order[np.concatenate([[True], np.diff(texels[order]) > 0])] if len(order) else order
+        texels, faces = texels[order], faces[order]  # where faces overlap, the first
         free = np.ones((stop - start) * self.side, bool)
         free[texels - start * self.side] = False
         here = np.zeros(len(self._corners), bool)
@@ -79,8 +74,15 @@ class Layout:
         all_texels = np.concatenate([texels, border])
         order = np.argsort(all_texels, kind="stable")
         return Coverage(self.side, all_texels[order], np.concatenate([near[faces], owners])[order].astype(np.int32),
-                        np.concatenate([inside, nearest])[order], np.concatenate([inside, at_centre])[order],
-                        overlapping.astype(np.int32))
+                        np.concatenate([inside, nearest])[order], np.concatenate([inside, at_centre])[order])
+
+    def overlapping(self) -> NDArray[np.int64]:
+        """(m, 2) pairs of triangles that hold the same texel's centre, each pair once."""
+        texels, faces = _centres_inside(self._corners, self.side, 0, self.side)
+        order = np.lexsort((faces, texels))
+        texels, faces = texels[order], faces[order]
+        again = np.flatnonzero(texels[1:] == texels[:-1])
+        return np.unique(np.stack([faces[again], faces[again + 1]], 1), axis=0)
 
 
 def check_range(uv: NDArray) -> None:

@@ -19,9 +19,13 @@ from .raster import Layout
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
 from .texels import NormalMap, fill_map, texel_points
+from .unwrap import unwrap
 
 CHANNELS = 4             # coefficients that one image holds
 MIN_SIDE, MAX_SIDE = 16, 8192
+_CHECKED = 1024          # a side at which overlaps are looked for; more would find slivers that no one sees
+_ATLAS_SHARE = 0.1       # of the progress
+_REPAIRS = 3             # times that faces over each other are laid out anew, each alone
 _TILE = 1 << 18          # texels of a tile, covered or not: some seconds of work
 _OURS = re.compile(r"\d{4}\.(npy|json)")
 _JOB = "job.json"
@@ -31,6 +35,7 @@ _JOB = "job.json"
 class TextureTransfer:
     """Transfer at the covered texels of a texture, and the record that explains it."""
 
+    uv: NDArray[np.float64]                  # (C, 2) of each face corner
     texels: list[NDArray[np.int64]]          # of each tile, (n,) row * side + column
     coefficients: list[NDArray[np.float32]]  # of each tile, (n, K)
     record: BakeRecord
@@ -57,14 +62,17 @@ def image_count(order: int) -> int:
     return -(-order * order // CHANNELS)
 
 
-def bake(surface: Surface, uv: NDArray, side: int, method: str = "embree", order: int = 5, *, rays: int | None = None,
+def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArray | None = None,
+         side: int | None = None, texels_per_metre: float | None = None, padding: int = 2, rays: int | None = None,
          tolerance: float | None = None, occluders: Sequence[Geometry] = (), normal_maps: Sequence[NormalMap] = (),
          seed: int = 0, threads: int | None = None, folder: Path | None = None, key: str = "",
          ) -> Generator[float, None, TextureTransfer]:
     """Bake the transfer of a texture's texels.
 
     Args:
-        uv: (C, 2) of each face corner, 0 to 1, without overlaps. side: texels a side.
+        uv: (C, 2) of each face corner, 0 to 1, without overlaps; an atlas is made where not given.
+        side: texels a side, or, for an atlas, texels_per_metre to have it as large as that takes.
+        padding: texels between the charts of an atlas.
         method, order, rays, tolerance, occluders, seed, threads: as `methods.bake`; a tolerance is
             met by every tile.
         folder: where finished tiles are kept, so that a bake that was killed goes on from there and
@@ -75,8 +83,15 @@ def bake(surface: Surface, uv: NDArray, side: int, method: str = "embree", order
         UserError: arguments out of range, UVs outside the texture, or faces that overlap in it.
     """
     began = time.perf_counter()
-    if not MIN_SIDE <= side <= MAX_SIDE:
-        raise UserError(f"The resolution must be {MIN_SIDE} to {MAX_SIDE} texels, not {side}.")
+    _check_side(side, texels_per_metre)
+    start_at = 0.0
+    if uv is None:
+        start_at = _ATLAS_SHARE
+        uv, side = yield from _atlas(surface, side, texels_per_metre, padding)
+        _check_side(side, None)
+    elif len(pairs := Layout(uv[surface.corners], surface.triangles, min(side or 0, _CHECKED)).overlapping()):
+        raise UserError(overlap_message(pairs, surface.polygons))
+    assert side is not None
     layout = Layout(uv[surface.corners], surface.triangles, side)
     store = _Store(folder, key) if folder is not None else None
     scene: Occluders | None = None
@@ -85,9 +100,8 @@ def bake(surface: Surface, uv: NDArray, side: int, method: str = "embree", order
     for number, start in enumerate(range(0, side, rows)):
         stop = min(start + rows, side)
         coverage = layout.coverage(start, stop)
-        if len(coverage.overlapping):
-            raise UserError(overlap_message(coverage.overlapping, surface.polygons))
-        yield start / side
+        done, share = start_at + (1 - start_at) * start / side, (1 - start_at) * (stop - start) / side
+        yield done
         if not len(coverage.texels):
             continue
         found = store.load(number, len(coverage.texels)) if store else None
@@ -99,7 +113,7 @@ def bake(surface: Surface, uv: NDArray, side: int, method: str = "embree", order
                                   threads=threads, scene=scene)
             try:
                 while True:
-                    yield (start + next(baking) * (stop - start)) / side
+                    yield done + share * next(baking)
             except StopIteration as end:
                 found = end.value.coefficients, end.value.record
             finally:
@@ -111,7 +125,36 @@ def bake(surface: Surface, uv: NDArray, side: int, method: str = "embree", order
         records.append(found[1])
     if not texels:
         raise UserError("The UVs leave no face any room in the texture, so there is nothing to bake.")
-    return TextureTransfer(texels, coefficients, _whole(records, coefficients, seed, side, began))
+    return TextureTransfer(uv, texels, coefficients, _whole(records, coefficients, seed, side, began))
+
+
+def _check_side(side: int | None, texels_per_metre: float | None) -> None:
+    """UserError unless a texture of this size can be baked."""
+    if side is None:
+        if not (texels_per_metre is not None and 0 < texels_per_metre < np.inf):
+            raise UserError("Give a resolution, or a positive number of texels per metre.")
+    elif not MIN_SIDE <= side <= MAX_SIDE:
+        raise UserError(f"The resolution must be {MIN_SIDE} to {MAX_SIDE} texels, not {side}.")
+
+
+def _atlas(surface: Surface, side: int | None, texels_per_metre: float | None, padding: int
+           ) -> Generator[float, None, tuple[NDArray, int]]:
+    """UVs (C, 2) of the surface's own, and their side."""
+    apart = np.zeros(len(surface.corners), bool)
+    for _ in range(_REPAIRS):
+        unwrapping = unwrap(surface, side=side, texels_per_metre=texels_per_metre, padding=padding, apart=apart)
+        try:
+            while True:
+                yield _ATLAS_SHARE * next(unwrapping)
+        except StopIteration as end:
+            atlas = end.value
+        finally:
+            unwrapping.close()
+        pairs = Layout(atlas.uv[surface.corners], surface.triangles, min(atlas.side, _CHECKED)).overlapping()
+        if not len(pairs):
+            break
+        apart[pairs.ravel()] = True  # charts that lie over themselves
+    return atlas.uv, atlas.side
 
 
 def overlap_message(pairs: NDArray, polygons: NDArray) -> str:

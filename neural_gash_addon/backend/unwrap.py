@@ -39,14 +39,14 @@ class Atlas:
 
 
 def unwrap(surface: Surface, *, side: int | None, texels_per_metre: float | None = None, padding: int = 2,
-           ) -> Generator[float, None, Atlas]:
+           apart: NDArray[np.bool_] | None = None) -> Generator[float, None, Atlas]:
     """Lay out the faces of a mesh in a square texture, without overlaps.
 
     Seams follow where normals split; the triangles of a polygon stay together.
 
     Args:
         side: texels a side, or None and texels_per_metre, which decides it.
-        padding: texels between charts.
+        padding: texels between charts. apart: (F,) triangles to lay out alone.
     Yields:
         Progress, 0 to 1.
     Raises:
@@ -67,6 +67,8 @@ def unwrap(surface: Surface, *, side: int | None, texels_per_metre: float | None
         areas += found
         yield 0.8 * (number + 1) / len(pieces)
     alone = _torn(local, positions, triangles, corners, polygons)
+    if apart is not None:
+        alone |= np.isin(polygons, polygons[apart])
     if alone.any():
         local[alone] = _laid_flat(positions[triangles[alone]], polygons[alone])
         pieces = [kept for piece in pieces if len(kept := piece[~alone[piece]])] + [np.flatnonzero(alone)]

@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.errors import UserError
-from ..backend.geometry import TriangleMesh
+from ..backend.geometry import Surface, TriangleMesh, unit
 from .attributes import RECORD, discard
 from .evaluation import evaluated, revealed
 from .frames import Array, as_array, bake_frame, rotation_part
@@ -31,8 +32,13 @@ __all__ = ["SELF", "VISIBLE", "SceneMesh", "bake_frame", "fingerprint", "make_ap
 class SceneMesh:
     """What `read_object` gives."""
 
-    mesh: TriangleMesh  # in world axes, metres; vertices and corners in Blender's order
-    matrix: Array       # (4, 4) the object's world matrix when it was read
+    surface: Surface  # in world axes, metres; vertices and corners in Blender's order
+    matrix: Array     # (4, 4) the object's world matrix when it was read
+
+    @cached_property
+    def mesh(self) -> TriangleMesh:
+        """The points of a bake to vertices."""
+        return self.surface.vertex_points()
 
     @property
     def frame(self) -> tuple[float, ...]:
@@ -78,14 +84,14 @@ def read_object(obj: bpy.types.Object | None, depsgraph: bpy.types.Depsgraph) ->
             local = _positions(mesh)
             _check_coordinates(obj.name, local, matrix)
             corner_vertices = _corner_vertices(mesh)
-            triangles = _triangles(mesh, corner_vertices)
+            corners = _triangle_corners(mesh)
             normals = np.empty((len(corner_vertices), 3), np.float32)
             mesh.corner_normals.foreach_get("vector", normals.ravel())
             sizes = np.empty(len(mesh.polygons), np.int32)
             mesh.polygons.foreach_get("loop_total", sizes)
         finally:
             copy.to_mesh_clear()
-    if not len(triangles):
+    if not len(corners):
         raise UserError(f"'{obj.name}' has no faces, so there is nothing to bake.")
     linear = matrix[:3, :3]
     # Rounding of the floats that Blender holds: the local coordinates', grown by the largest scale.
@@ -93,9 +99,8 @@ def read_object(obj: bpy.types.Object | None, depsgraph: bpy.types.Depsgraph) ->
     spacing = float(np.spacing(np.abs(local).max())) * float(np.linalg.norm(linear, 2))
     corner_faces = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)
     normals = normals @ np.linalg.inv(linear).astype(np.float32)  # inverse transpose: outward in mirrors, too
-    return SceneMesh(TriangleMesh.from_corners(_transform(local, matrix), _outward(triangles, matrix),
-                                               corner_vertices, normals, corner_faces,
-                                               resolution=spacing), matrix)
+    return SceneMesh(Surface(_transform(local, matrix), corner_vertices, unit(normals).astype(np.float32), corner_faces,
+                             _outward(corners, matrix), spacing), matrix)
 
 
 def make_applied_copy(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bpy.types.Object:
@@ -267,7 +272,7 @@ def _solid_arrays(solid: bpy.types.Object) -> tuple[NDArray[np.float32], NDArray
         if not len(mesh.polygons):
             return None
         positions = _positions(mesh)
-        triangles = _triangles(mesh, _corner_vertices(mesh))
+        triangles = _corner_vertices(mesh)[_triangle_corners(mesh)]
         finite = np.isfinite(positions).all(axis=1)
         return np.nan_to_num(positions), triangles[finite[triangles].all(axis=1)]
     finally:
@@ -289,12 +294,12 @@ def _corner_vertices(mesh: bpy.types.Mesh) -> NDArray[np.int32]:
     return out
 
 
-def _triangles(mesh: bpy.types.Mesh, corner_vertices: NDArray[np.int32]) -> NDArray[np.int32]:
-    """(F, 3) vertex indices."""
+def _triangle_corners(mesh: bpy.types.Mesh) -> NDArray[np.int32]:
+    """(F, 3) face corners of each triangle."""
     mesh.calc_loop_triangles()
     corners = np.empty((len(mesh.loop_triangles), 3), np.int32)
     mesh.loop_triangles.foreach_get("loops", corners.ravel())
-    return corner_vertices[corners]
+    return corners
 
 
 def _check_topology(obj: bpy.types.Object, mesh: bpy.types.Mesh) -> None:

@@ -49,7 +49,7 @@ def test_centres_equal_the_slow_twin(seed):
     assert set(found.texels[inside]) == set(slow)
     for texel, face in zip(found.texels[inside], found.faces[inside], strict=True):
         assert face == min(slow[texel])
-    pairs = {tuple(p) for p in found.overlapping}
+    pairs = {tuple(p) for p in Layout(uv, triangles, side).overlapping()}
     assert {(a, b) for faces in slow.values() for a, b in zip(faces[:-1], faces[1:], strict=True)} == pairs
 
 
@@ -57,7 +57,7 @@ def test_centres_equal_the_slow_twin(seed):
 def test_joined_triangles_share_no_texel_and_leave_no_hole(side):
     uv, triangles = grid(16, 0.0)   # edges may run exactly through centres
     found = Layout(uv, triangles, side).coverage()
-    assert not len(found.overlapping)
+    assert not len(Layout(uv, triangles, side).overlapping())
     centres = (np.stack([found.texels % side, found.texels // side], 1) + 0.5) / side
     inside = np.zeros(side * side, bool)
     inside[found.texels] = True

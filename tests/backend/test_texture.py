@@ -58,7 +58,7 @@ def test_atlas_gives_every_face_room_of_its_own(geometry):
     found = atlas(mesh)
     assert found.side == 128 and found.uv.min() >= 0 and found.uv.max() <= 1
     uv = found.uv[mesh.corners]
-    assert not len(Layout(uv, mesh.triangles, 512).coverage().overlapping)
+    assert not len(Layout(uv, mesh.triangles, 512).overlapping())
     corners = mesh.positions[mesh.triangles]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
@@ -85,7 +85,7 @@ def test_polygons_are_not_torn():
         normals += [mesh.corner_normals[np.flatnonzero(triangles.ravel() == v)[0]] for v in own]
     quad = Surface(positions, np.array(vertices), np.array(normals), np.array(faces), np.array(corners), 0.0)
     found = atlas(quad, 256)
-    assert not len(Layout(found.uv[quad.corners], quad.triangles, 1024).coverage().overlapping)
+    assert not len(Layout(found.uv[quad.corners], quad.triangles, 1024).overlapping())
     uv = found.uv[quad.corners]
     a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     assert (np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 0).all()
@@ -127,7 +127,7 @@ def test_broken_faces_are_laid_out_without_a_crash():
 def test_convex_mesh_equals_the_analytic_coefficients_across_seams():
     mesh = surface(shapes.sphere(3))
     found = atlas(mesh, 256)
-    result = methods.run(texture.bake(mesh, found.uv, 256, "embree", 5, rays=64))
+    result = methods.run(texture.bake(mesh, "embree", 5, uv=found.uv, side=256, rays=64))
     every = {}
     for name, edges in (("inside", False), ("edges", True)):
         uv, normals = surface_samples(mesh, found.uv, edges=edges)
@@ -159,14 +159,14 @@ def test_floor_under_a_box_has_its_shadow_and_none_where_it_is_open():
     occluder = (box[0] * 0.8 + [0, 0, 0.5], box[1])
     mesh = surface(floor)
     uv = (mesh.positions[mesh.corner_vertices][:, :2] + 2) / 4
-    result = methods.run(texture.bake(mesh, uv, 64, order=3, rays=256, occluders=[occluder]))
+    result = methods.run(texture.bake(mesh, uv=uv, side=64, order=3, rays=256, occluders=[occluder]))
     reference_points = np.array([[0.9, 0.1, 0], [1.4, -1.2, 0], [0.55, 0.5, 0], [-1.9, 1.9, 0]])
     target = shapes.at_points(floor, reference_points, np.tile([0., 0, 1], (4, 1)))
     truth = methods.run(methods.bake(target, order=3, rays=4096, seed=7, occluders=[occluder])).coefficients
     found = lookup(result, (reference_points[:, :2] + 2) / 4)
     np.testing.assert_allclose(found, truth, atol=0.02)
     assert lookup(result, np.array([[0.5, 0.5]]))[0, 0] < 0.25 * sh.cosine_lobe(np.array([[0., 0, 1]]), 3)[0, 0]
-    open_floor = methods.run(texture.bake(mesh, uv, 64, order=3, rays=64))
+    open_floor = methods.run(texture.bake(mesh, uv=uv, side=64, order=3, rays=64))
     np.testing.assert_allclose(lookup(open_floor, np.random.default_rng(0).uniform(size=(50, 2))),
                                np.tile(sh.cosine_lobe(np.array([[0., 0, 1]]), 3), (50, 1)), atol=1e-6)
 
@@ -174,14 +174,14 @@ def test_floor_under_a_box_has_its_shadow_and_none_where_it_is_open():
 def test_closed_box_lets_no_light_in():
     mesh = surface(shapes.cube(inside=True), smooth=False)
     found = atlas(mesh, 64)
-    result = methods.run(texture.bake(mesh, found.uv, 64, order=3, rays=64))
+    result = methods.run(texture.bake(mesh, uv=found.uv, side=64, order=3, rays=64))
     assert max(np.abs(c).max() for c in result.coefficients) < 1e-6
 
 
 def test_coarse_smooth_mesh_does_not_shadow_itself():
     mesh = surface(shapes.sphere(1))
     found = atlas(mesh, 64)
-    result = methods.run(texture.bake(mesh, found.uv, 64, order=3, rays=256))
+    result = methods.run(texture.bake(mesh, uv=found.uv, side=64, order=3, rays=256))
     coverage = Layout(found.uv[mesh.corners], mesh.triangles, 64).coverage()
     exact = sh.cosine_lobe(texel_points(mesh, coverage).normals, 3)
     assert metrics.rel_l2(np.concatenate(result.coefficients), exact) < 0.01
@@ -211,9 +211,9 @@ def test_a_bake_that_was_killed_goes_on_and_gives_the_same_bytes(tmp_path, monke
     mesh = surface(shapes.torus())
     found = atlas(mesh, 64)
     settings = {"order": 3, "tolerance": 0.05, "key": "a"}
-    whole = methods.run(texture.bake(mesh, found.uv, 64, **settings))
+    whole = methods.run(texture.bake(mesh, uv=found.uv, side=64, **settings))
     assert len(whole.texels) == 4
-    baking = texture.bake(mesh, found.uv, 64, folder=tmp_path / "tiles", **settings)
+    baking = texture.bake(mesh, uv=found.uv, side=64, folder=tmp_path / "tiles", **settings)
     while len(list((tmp_path / "tiles").glob("*.json"))) < 4:   # the job's and three tiles'
         next(baking)
     baking.close()
@@ -222,12 +222,12 @@ def test_a_bake_that_was_killed_goes_on_and_gives_the_same_bytes(tmp_path, monke
     traced = []
     original = methods.bake
     monkeypatch.setattr(methods, "bake", lambda *a, **k: traced.append(1) or original(*a, **k))
-    again = methods.run(texture.bake(mesh, found.uv, 64, folder=tmp_path / "tiles", **settings))
+    again = methods.run(texture.bake(mesh, uv=found.uv, side=64, folder=tmp_path / "tiles", **settings))
     assert len(traced) == 2                       # the torn one, and the one that was missing
     for a, b in zip(whole.coefficients, again.coefficients, strict=True):
         assert a.tobytes() == np.asarray(b).tobytes()
     assert again.record.rays == whole.record.rays and again.record.error_estimate == whole.record.error_estimate
-    methods.run(texture.bake(mesh, found.uv, 64, folder=tmp_path / "tiles", **{**settings, "key": "b"}))
+    methods.run(texture.bake(mesh, uv=found.uv, side=64, folder=tmp_path / "tiles", **{**settings, "key": "b"}))
     assert len(traced) == 6                       # another bake: nothing of the first is taken
     (tmp_path / "tiles" / "mine.txt").write_text("kept")
     texture.remove_tiles(tmp_path / "tiles")
@@ -236,7 +236,7 @@ def test_a_bake_that_was_killed_goes_on_and_gives_the_same_bytes(tmp_path, monke
 
 def test_record_tells_of_the_texture():
     mesh = surface(shapes.torus())
-    record = methods.run(texture.bake(mesh, atlas(mesh, 64).uv, 64, order=2, rays=16, seed=5)).record
+    record = methods.run(texture.bake(mesh, uv=atlas(mesh, 64).uv, side=64, order=2, rays=16, seed=5)).record
     assert (record.target, record.side, record.domain, record.order, record.seed) == ("texture", 64, "TEXEL", 2, 5)
     assert record.rays == 16 * record.points and 0 < record.error_estimate < 0.2
     assert json.loads(record.to_json())["side"] == 64
@@ -247,17 +247,28 @@ def test_overlapping_faces_are_named():
     uv = atlas(mesh, 64).uv
     uv[mesh.corners[4]] = uv[mesh.corners[9]]
     with pytest.raises(UserError, match="4 and 9"):
-        methods.run(texture.bake(mesh, uv, 64, rays=4))
+        methods.run(texture.bake(mesh, uv=uv, side=64, rays=4))
 
 
 @pytest.mark.parametrize("side", [0, 8, 10000])
 def test_sides_out_of_range_are_refused(side):
     mesh = surface(shapes.cube())
     with pytest.raises(UserError, match="resolution"):
-        methods.run(texture.bake(mesh, np.zeros((len(mesh.corner_vertices), 2)), side, rays=4))
+        methods.run(texture.bake(mesh, uv=np.zeros((len(mesh.corner_vertices), 2)), side=side, rays=4))
 
 
 def test_uv_map_without_area_is_refused():
     mesh = surface(shapes.cube())
     with pytest.raises(UserError):
-        methods.run(texture.bake(mesh, np.full((len(mesh.corner_vertices), 2), 0.5), 32, rays=4))
+        methods.run(texture.bake(mesh, uv=np.full((len(mesh.corner_vertices), 2), 0.5), side=32, rays=4))
+
+
+def test_own_atlas_equals_the_one_made_before():
+    mesh = surface(shapes.torus())
+    both = [methods.run(texture.bake(mesh, uv=uv, side=64, order=2, rays=16)) for uv in (None, atlas(mesh, 64).uv)]
+    np.testing.assert_array_equal(both[0].uv, both[1].uv)
+    np.testing.assert_array_equal(both[0].coefficients[0], both[1].coefficients[0])
+    sized = methods.run(texture.bake(mesh, texels_per_metre=10, order=2, rays=4))
+    assert 20 < sized.record.side < 200
+    with pytest.raises(UserError, match="resolution"):
+        methods.run(texture.bake(mesh, rays=4))
