@@ -91,6 +91,9 @@ def main(argv: Sequence[str]) -> int:
     except UserError as error:
         print(f"neural_gash: {error}", file=sys.stderr)
         return BAD_INPUT
+    except OSError as error:  # no room, a name too long, a pipe that closed
+        print(f"neural_gash: {error.filename or 'a file'} cannot be written: {exchange.reason(error)}", file=sys.stderr)
+        return BAD_INPUT
     except KeyboardInterrupt:
         print("neural_gash: interrupted", file=sys.stderr)
         return INTERRUPTED
@@ -148,8 +151,7 @@ def _relight(arguments: argparse.Namespace) -> tuple[dict, str]:
         light = rotated_light(_hdri_light(arguments.hdri, record.order), *turn)
         radiance = shading.radiance(arrays["transfer"], light).astype(np.float32)
         if arguments.npz:
-            with exchange.atomic(arguments.npz.absolute()) as draft, draft.open("wb") as file:
-                np.savez_compressed(file, positions=arrays["positions"], radiance=radiance, light=light)
+            exchange.write_npz(arguments.npz.absolute(), positions=arrays["positions"], radiance=radiance, light=light)
         name = Path(arguments.input).name
     elif suffix == ".blend":
         if arguments.npz:

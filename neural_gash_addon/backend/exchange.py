@@ -2,6 +2,7 @@
 """Bakes as .npz files, for people who compute. No pickles."""
 from __future__ import annotations
 
+import io
 import os
 import tempfile
 import zipfile
@@ -40,7 +41,11 @@ def reason(error: OSError) -> str:
 
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
-    """A file beside `path`, of the same suffix, to write; it takes the place of `path` only once whole."""
+    """A file beside `path`, of the same suffix, to write; it takes the place of `path` only once whole.
+
+    Where `path` is a link, what it leads to is replaced, and keeps its permissions.
+    """
+    path = Path(os.path.realpath(path))
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
     os.close(handle)
     draft = Path(name)
@@ -48,7 +53,7 @@ def atomic(path: Path) -> Iterator[Path]:
         yield draft
         mask = os.umask(0)
         os.umask(mask)
-        draft.chmod(0o666 & ~mask)  # mkstemp's files are for their owner only
+        draft.chmod(path.stat().st_mode & 0o777 if path.exists() else 0o666 & ~mask)  # mkstemp's are its owner's only
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)
@@ -60,10 +65,17 @@ def save_npz(path: Path, mesh: TriangleMesh, transfer: Transfer) -> None:
     For the POINT domain the points are the mesh's vertices in their order; for CORNER,
     `elements` gives the point of each face corner.
     """
-    with atomic(path) as draft, draft.open("wb") as file:
-        np.savez_compressed(file, positions=mesh.points.astype(np.float32), normals=mesh.normals.astype(np.float32),
-                            transfer=transfer.coefficients, domain=np.array(mesh.domain), elements=mesh.elements,
-                            record=np.array(transfer.record.to_json()))
+    write_npz(path, positions=mesh.points.astype(np.float32), normals=mesh.normals.astype(np.float32),
+              transfer=transfer.coefficients, domain=np.array(mesh.domain), elements=mesh.elements,
+              record=np.array(transfer.record.to_json()))
+
+
+def write_npz(path: Path, **arrays: NDArray) -> None:
+    """Write arrays in one step. OSError where there is no room: zipfile, left to write to the disk, hides it."""
+    content = io.BytesIO()
+    np.savez_compressed(content, **arrays)
+    with atomic(path) as draft:
+        draft.write_bytes(content.getbuffer())
 
 
 def load_npz(path: Path) -> tuple[dict[str, NDArray], BakeRecord]:
@@ -78,4 +90,8 @@ def load_npz(path: Path) -> tuple[dict[str, NDArray], BakeRecord]:
             record = str(data["record"])
     except _UNREADABLE as error:
         raise UserError(f"'{path}' is missing or no bake that Neural GASh saved.") from error
-    return arrays, BakeRecord.from_json(record)
+    found = BakeRecord.from_json(record)
+    transfer = arrays["transfer"]
+    if transfer.dtype.kind != "f" or transfer.shape != (len(arrays["positions"]), found.order ** 2):
+        raise UserError(f"'{path}' does not hold the coefficients that its record tells of.")
+    return arrays, found

@@ -14,6 +14,7 @@ Geometry = tuple[NDArray, NDArray]  # positions (V, 3), triangles (F, 3)
 OFFSET = 3e-6
 # ... and relative to the spacing of the coordinates as they came, whose rounding tilts flat faces.
 RESOLUTION_STEPS = 2.0
+_FARTHEST = 1e15  # of coordinates: Embree's boxes hold no more
 # Triangles handed to Embree at a time: its wrapper copies them holding the interpreter's lock, for
 # about 40 ms a piece, and a window must get a turn in between.
 PIECE = 1 << 15
@@ -22,20 +23,25 @@ PIECE = 1 << 15
 class Occluders:
     """Triangles that block; asks whether rays meet any of them.
 
-    Coordinates are centred and scaled to a unit box in float64 before Embree's float32 sees them,
+    Coordinates are centred on what is baked and scaled to its size in float64 before Embree's float32 sees them,
     so a bake is as exact at any size and at any distance from the origin as its input is.
     """
 
     def __init__(self, geometry: Sequence[Geometry], resolution: float = 0.0) -> None:
-        """Build and commit. geometry: parts (positions, triangles); resolution in metres (see TriangleMesh)."""
+        """Build and commit.
+
+        geometry: parts (positions, triangles), what is baked first. resolution: of its coordinates,
+        metres (see TriangleMesh).
+        """
         from embreex.mesh_construction import TriangleMesh as EmbreeMesh
         from embreex.rtcore_scene import EmbreeScene
 
         parts = [(np.asarray(p, dtype=np.float64), np.asarray(t, dtype=np.int32)) for p, t in geometry]
         parts = [(p, t) for p, t in parts if len(p) and len(t)]
-        corners = [p[np.unique(t)] for p, t in parts]  # loose vertices do not stretch the box
-        low = np.min([c.min(0) for c in corners], axis=0)
-        high = np.max([c.max(0) for c in corners], axis=0)
+        # The box is that of what is baked, however large the world around it: rays must not start
+        # farther off a coin on a floor because the floor is wide. Loose vertices do not stretch it.
+        corners = parts[0][0][np.unique(parts[0][1])]
+        low, high = corners.min(0), corners.max(0)
         self.centre = 0.5 * (low + high)
         extent = float(np.max(high - low))
         self.scale = 1.0 / extent if extent > 0 else 1.0
@@ -50,12 +56,14 @@ class Occluders:
 
     def normalise(self, positions: NDArray) -> NDArray[np.float32]:
         """World positions (N, 3) in the scene's own coordinates."""
-        return np.ascontiguousarray((positions - self.centre) * self.scale, dtype=np.float32)
+        local = np.clip((positions - self.centre) * self.scale, -_FARTHEST, _FARTHEST)
+        return np.ascontiguousarray(local, dtype=np.float32)
 
     def origins(self, points: NDArray, clearance: NDArray) -> NDArray[np.float32]:
-        """Where rays from points (N, 3) start: `clearance` (N, 3) offsets away."""
+        """Where rays from points (N, 3) start: `clearance` (N, 3) offsets away, more where floats are coarser."""
         local = (points - self.centre) * self.scale
-        return (local + self.offset * clearance).astype(np.float32)
+        coarser = np.maximum(1.0, 2.0 * np.abs(local).max(1, keepdims=True, initial=0.0))
+        return (local + self.offset * coarser * clearance).astype(np.float32)
 
     def blocked(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.int32]:
         """0 where a ray is blocked, -1 where it is free. Both (R, 3) float32, contiguous. Releases the GIL."""

@@ -5,7 +5,11 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, fields
 
+import numpy as np
+
 from .errors import UserError
+from .geometry import CORNER, POINT, TEXEL
+from .spherical_harmonics import MAX_ORDER
 
 SCHEMA = 1
 VERSION = "0.1.0"
@@ -58,7 +62,7 @@ class BakeRecord:
         try:
             data = json.loads(text)
             schema = int(data["schema"])
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, KeyError, OverflowError) as error:
             raise UserError("The record of this bake is unreadable; bake again.") from error
         if schema > SCHEMA:
             raise UserError(f"This bake was made by a newer Neural GASh ({data.get('version', 'unknown')}); "
@@ -69,10 +73,11 @@ class BakeRecord:
             raise UserError(_DAMAGED)
         try:
             record = BakeRecord(**values)
-            frame = tuple(float(v) for v in record.frame)
+            frame = np.array(record.frame, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise UserError(_DAMAGED) from error
-        if len(frame) != 9 or not 1 <= record.order <= 16:
+        if (frame.shape != (9,) or not np.allclose(frame.reshape(3, 3) @ frame.reshape(3, 3).T, np.eye(3), atol=1e-3)
+                or not 1 <= record.order <= MAX_ORDER or record.domain not in (POINT, CORNER, TEXEL)):
             raise UserError(_DAMAGED)
-        object.__setattr__(record, "frame", frame)
+        object.__setattr__(record, "frame", tuple(frame.tolist()))
         return record

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where a bake lives on a mesh: attributes `_prt_0`, `_prt_1`, … and the record beside them.
+"""Where a bake lives on a mesh: attributes `_prt_0`, `_prt_1`, … or images, and the record beside them.
 
 Attribute i holds coefficients 4i..4i+3 as red, green, blue, alpha of a FLOAT_COLOR: float32,
 signed, exact, and four of them for one of the 14 attributes that EEVEE can draw. The leading
@@ -8,20 +8,26 @@ underscore makes the glTF exporter carry them.
 from __future__ import annotations
 
 import re
+from dataclasses import replace
+from pathlib import Path
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.errors import UserError
-from ..backend.geometry import POINT, TriangleMesh
+from ..backend.geometry import POINT, TEXEL, TriangleMesh
 from ..backend.record import BakeRecord
+from ..backend.spherical_harmonics import MAX_ORDER
+from ..backend.texture import TextureTransfer
 from ..backend.transfer import Transfer
+from .images import attach, bake_images, detach, make_images
+from .uv_maps import check_room, remove_own_uv, write_own_uv
 
 RECORD = "neural_gash"  # custom property on the mesh
 PREFIX = "_prt_"
 CHANNELS = 4
-_OURS = re.compile(rf"{PREFIX}\d+")
+_OURS = re.compile(rf"{PREFIX}\d+")  # chosen as 'the' colour by Blender, not by a person
 
 
 def attribute_count(order: int) -> int:
@@ -45,17 +51,16 @@ def write_transfer(obj: bpy.types.Object, mesh: TriangleMesh, transfer: Transfer
             these names that no bake made.
     """
     data = obj.data
-    if obj.mode == "EDIT":
-        raise UserError(f"'{obj.name}' is in Edit Mode, which would discard the bake; "
-                        "leave Edit Mode and bake again.")
+    _check_mode(obj)
     if len(mesh.elements) != len(data.vertices if mesh.domain == POINT else data.loops):
         raise UserError(f"'{obj.name}' was changed while it was being baked; bake again.")
     count = attribute_count(transfer.record.order)
-    if RECORD not in data:
-        taken = [n for n in (f"{PREFIX}{i}" for i in range(count)) if n in data.attributes]
-        if taken:
-            raise UserError(f"'{obj.name}' has an attribute '{taken[0]}' that no bake of it made; "
-                            "rename or remove it to bake.")
+    own = _own_attributes(data)
+    names = {f"{PREFIX}{i}" for i in range(count)} - set(own)
+    taken = sorted(names & {*data.attributes.keys(), *obj.vertex_groups.keys()})  # groups share the name space
+    if taken:
+        raise UserError(f"'{obj.name}' has an attribute or vertex group '{taken[0]}' that no bake of it made; "
+                        "rename or remove it to bake.")
     discard(data)
     chosen = _chosen_attributes(data)
     terms = transfer.coefficients.shape[1]
@@ -72,6 +77,45 @@ def write_transfer(obj: bpy.types.Object, mesh: TriangleMesh, transfer: Transfer
     data.update_tag()
 
 
+def write_textures(obj: bpy.types.Object, transfer: TextureTransfer, *, own_uv: bool, folder: Path | None, half: bool
+                   ) -> str:
+    """Store a texture bake on the object's mesh in place of any earlier bake.
+
+    Args:
+        own_uv: the UVs are an atlas of the bake's own, which becomes a UV map of the mesh.
+        folder, half: see `images.make_images`.
+    Returns:
+        The name of the UV map.
+    Raises:
+        UserError: as `write_transfer`, or the files or the UV map cannot be made; nothing has changed then.
+    """
+    data = obj.data
+    _check_mode(obj)
+    if len(transfer.uv) != len(data.loops):
+        raise UserError(f"'{obj.name}' was changed while it was being baked; bake again.")
+    if own_uv:
+        check_room(data)
+    images = make_images(obj.name, transfer, folder, half)
+    discard(data)
+    uv_map = write_own_uv(data, transfer.uv) if own_uv else transfer.record.uv_map
+    attach(data, images)
+    data[RECORD] = replace(transfer.record, uv_map=uv_map).to_json()
+    data.update_tag()
+    return uv_map
+
+
+def set_fingerprint(obj: bpy.types.Object, fingerprint: str) -> None:
+    """Put the fingerprint into the record of the bake on the object's mesh."""
+    obj.data[RECORD] = replace(read_record(obj), fingerprint=fingerprint).to_json()
+
+
+def _check_mode(obj: bpy.types.Object) -> None:
+    """UserError in Edit Mode."""
+    if obj.mode == "EDIT":
+        raise UserError(f"'{obj.name}' is in Edit Mode, which would discard the bake; "
+                        "leave Edit Mode and bake again.")
+
+
 def read_transfer(obj: bpy.types.Object) -> tuple[NDArray[np.float32], BakeRecord]:
     """The bake on the object's mesh: (E, K) coefficients of each vertex or face corner, and the record.
 
@@ -80,18 +124,30 @@ def read_transfer(obj: bpy.types.Object) -> tuple[NDArray[np.float32], BakeRecor
     """
     record = read_record(obj)
     data = obj.data
+    if record.domain == TEXEL:
+        raise UserError(f"'{obj.name}' is baked to textures, not to its vertices.")
+    check_whole(data, record)
     elements = len(data.vertices if record.domain == POINT else data.loops)
     columns = []
     for index in range(attribute_count(record.order)):
-        attribute = data.attributes.get(f"{PREFIX}{index}")
+        values = np.empty((elements, CHANNELS), np.float32)
+        data.attributes[f"{PREFIX}{index}"].data.foreach_get("color", values.ravel())
+        columns.append(values)
+    return np.concatenate(columns, axis=1)[:, :record.order ** 2], record
+
+
+def check_whole(data: bpy.types.Mesh, record: BakeRecord) -> None:
+    """UserError unless the mesh still has all attributes or images of its bake."""
+    if record.domain == TEXEL:
+        bake_images(data, record)
+        return
+    elements = len(data.vertices if record.domain == POINT else data.loops)
+    for name in (f"{PREFIX}{i}" for i in range(attribute_count(record.order))):
+        attribute = data.attributes.get(name)
         whole = (attribute is not None and attribute.data_type == "FLOAT_COLOR"
                  and attribute.domain == record.domain and len(attribute.data) == elements)
         if not whole:
-            raise UserError(f"The bake of '{obj.name}' has lost its attribute '{PREFIX}{index}'; bake again.")
-        values = np.empty((elements, CHANNELS), np.float32)
-        attribute.data.foreach_get("color", values.ravel())
-        columns.append(values)
-    return np.concatenate(columns, axis=1)[:, :record.order ** 2], record
+            raise UserError(f"The bake of '{data.name}' has lost its attribute '{name}'; bake again.")
 
 
 def read_record(obj: bpy.types.Object) -> BakeRecord:
@@ -111,11 +167,26 @@ def discard(data: bpy.types.Mesh) -> None:
     if RECORD not in data:
         return
     chosen = _chosen_attributes(data)
-    for name in [a.name for a in data.attributes if _OURS.fullmatch(a.name) and a.data_type == "FLOAT_COLOR"]:
+    for name in _own_attributes(data):
         data.attributes.remove(data.attributes[name])  # by name: removing moves the others in memory
     _choose_attributes(data, chosen)
+    remove_own_uv(data)
+    detach(data)
     del data[RECORD]
     data.update_tag()
+
+
+def _own_attributes(data: bpy.types.Mesh) -> list[str]:
+    """Names of the attributes that the bake on a mesh made: as many as its record says, of the kind that bakes make."""
+    if RECORD not in data:
+        return []
+    try:
+        record = BakeRecord.from_json(data[RECORD])
+        count = 0 if record.domain == TEXEL else attribute_count(record.order)
+    except UserError:
+        count = attribute_count(MAX_ORDER)
+    return [name for name in (f"{PREFIX}{i}" for i in range(count))
+            if name in data.attributes and data.attributes[name].data_type == "FLOAT_COLOR"]
 
 
 def _chosen_attributes(data: bpy.types.Mesh) -> tuple[str, str, str]:

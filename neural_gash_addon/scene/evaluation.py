@@ -46,3 +46,19 @@ def revealed(objects: Iterable[bpy.types.Object], depsgraph: bpy.types.Depsgraph
         for copy in copies:
             bpy.data.objects.remove(copy)
         bpy.data.scenes.remove(scene)
+
+
+def shown_objects(layer: bpy.types.ViewLayer) -> set[int]:
+    """Session uids of the objects that the viewport shows and a render of this view layer would.
+
+    The dependency graph lists objects of hidden collections too.
+    """
+    rendered: set[int] = set()
+    front = [layer.layer_collection]
+    while front:
+        place = front.pop()
+        if place.exclude or place.collection.hide_render:
+            continue
+        rendered |= {o.session_uid for o in place.collection.objects if not o.hide_render}
+        front += place.children
+    return {o.session_uid for o in layer.objects if o.session_uid in rendered and o.visible_get(view_layer=layer)}

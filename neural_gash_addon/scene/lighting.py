@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import bpy
 import numpy as np
+from bpy.app.handlers import persistent
 
 from ..backend import light as sh_light
 from ..backend import spherical_harmonics as sh
 from ..backend.errors import UserError
 from .attributes import read_record
+from .frames import as_array, bake_frame
 from .preview import is_on, update_light
 from .world import rotated_light, world_light
 
+_turns: dict[int, bytes] = {}  # session uid of an object -> its rotation when its preview was last lit for turning
 _LIGHT = "neural_gash_light"  # custom property of the scene: (K, 3) of the highest order, flat
 
 
@@ -32,7 +35,7 @@ def store_light(scene: bpy.types.Scene, light: np.ndarray) -> None:
 def current_light(scene: bpy.types.Scene, order: int) -> np.ndarray:
     """The light (K, 3) of the previews, as the sliders have it; a white sky before any was taken."""
     stored = scene.get(_LIGHT)
-    if stored is None:
+    if stored is None or len(stored) != 3 * sh.MAX_ORDER ** 2:
         light = sh_light.constant(np.ones(3), sh.MAX_ORDER)
     else:
         light = np.array(stored, dtype=np.float64).reshape(-1, 3)
@@ -46,6 +49,33 @@ def apply_light(scene: bpy.types.Scene) -> None:
     for obj in scene.objects:
         if is_on(obj):
             light_object(scene, obj)
+
+
+@persistent
+def _on_change(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    """Turn the light of previews whose object was turned: it is kept in the frame of the bake."""
+    for update in depsgraph.updates:
+        if isinstance(update.id, bpy.types.Object) and update.is_updated_transform:
+            obj = update.id.original
+            if not is_on(obj) or not np.isfinite(as_array(obj.matrix_world)).all():
+                continue
+            turned = bake_frame(obj).round(6).tobytes()
+            if turned != _turns.get(obj.session_uid):  # lighting it changes its material, which is a change again
+                _turns[obj.session_uid] = turned
+                light_object(scene, obj)
+
+
+def register() -> None:
+    """Start following objects that turn."""
+    bpy.app.handlers.depsgraph_update_post.append(_on_change)
+    bpy.app.handlers.frame_change_post.append(_on_change)
+
+
+def unregister() -> None:
+    """Stop."""
+    bpy.app.handlers.depsgraph_update_post.remove(_on_change)
+    bpy.app.handlers.frame_change_post.remove(_on_change)
+    _turns.clear()
 
 
 def light_object(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The node group that shades a bake: albedo * (T . L), T from attributes, L from its sockets."""
+"""The node group that shades a bake: albedo * (T . L), T from attributes or images, L from its sockets."""
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import bpy
 from numpy.typing import NDArray
@@ -14,18 +15,29 @@ _VERSION, _ORDER = "neural_gash_version", "neural_gash_order"  # custom properti
 DEFAULT_ALBEDO = 0.8
 
 
-def ensure_group(order: int) -> bpy.types.NodeTree:
+def ensure_group(order: int, images: Sequence[bpy.types.Image] = (), uv_map: str = "") -> bpy.types.NodeTree:
     """The group `PRT Shading <order>`: made where it is missing or of another version only.
 
     Inputs Albedo and L0..L{K-1}, one RGB vector for each coefficient of the light; output Shader, an
     emission. Its light is at first a white sky of radiance 1, which shows ambient occlusion.
+
+    Args:
+        images, uv_map: where the coefficients of a texture bake are; such a group is of that bake alone.
     """
+    place = [image.session_uid for image in images]
     for group in bpy.data.node_groups:
-        if group.get(_ORDER) == order and group.get(_VERSION) == GROUP_VERSION and group.library is None:
+        if (group.get(_ORDER) == order and group.get(_VERSION) == GROUP_VERSION and group.library is None
+                and _place(group) == (place, uv_map)):
             return group
     group = bpy.data.node_groups.new(f"PRT Shading {order}", "ShaderNodeTree")
-    _build(group, order)
+    _build(group, order, _images(group, images, uv_map) if images else _attributes(group, order))
     return group
+
+
+def _place(group: bpy.types.NodeTree) -> tuple[list[int], str]:
+    """Images (session uids) and UV map that a group reads."""
+    images = [n.image.session_uid if n.image else 0 for n in group.nodes if n.type == "TEX_IMAGE"]
+    return images, next((n.uv_map for n in group.nodes if n.type == "UVMAP"), "")
 
 
 def is_group(group: bpy.types.NodeTree | None) -> bool:
@@ -44,7 +56,41 @@ def set_light(node: bpy.types.ShaderNodeGroup, light: NDArray) -> None:
         node.inputs[f"L{index}"].default_value = value
 
 
-def _build(group: bpy.types.NodeTree, order: int) -> None:
+Sources = list[tuple[bpy.types.NodeSocket, bpy.types.NodeSocket]]  # colour and alpha: four coefficients
+
+
+def _add(group: bpy.types.NodeTree, kind: str, x: float, y: float) -> bpy.types.Node:
+    node = group.nodes.new(kind)
+    node.location = (x, y)
+    node.hide = True
+    return node
+
+
+def _attributes(group: bpy.types.NodeTree, order: int) -> Sources:
+    """Nodes that read the attributes of a bake to vertices."""
+    sources = []
+    for index in range(attribute_count(order)):
+        attribute = _add(group, "ShaderNodeAttribute", -600, -200 * index)
+        attribute.attribute_type = "GEOMETRY"
+        attribute.attribute_name = f"{PREFIX}{index}"
+        sources.append((attribute.outputs["Color"], attribute.outputs["Alpha"]))
+    return sources
+
+
+def _images(group: bpy.types.NodeTree, images: Sequence[bpy.types.Image], uv_map: str) -> Sources:
+    """Nodes that read the images of a texture bake."""
+    uv = _add(group, "ShaderNodeUVMap", -900, 0)
+    uv.uv_map = uv_map
+    sources = []
+    for index, image in enumerate(images):
+        texture = _add(group, "ShaderNodeTexImage", -650, -200 * index)
+        texture.image, texture.interpolation, texture.extension = image, "Linear", "EXTEND"
+        group.links.new(uv.outputs["UV"], texture.inputs["Vector"])
+        sources.append((texture.outputs["Color"], texture.outputs["Alpha"]))
+    return sources
+
+
+def _build(group: bpy.types.NodeTree, order: int, sources: Sources) -> None:
     """Fill the group. K multiply-adds, each of a scalar coefficient and an RGB light vector."""
     terms = order * order
     albedo = group.interface.new_socket("Albedo", in_out="INPUT", socket_type="NodeSocketColor")
@@ -54,37 +100,26 @@ def _build(group: bpy.types.NodeTree, order: int) -> None:
         socket.default_value = (math.sqrt(4 * math.pi) if index == 0 else 0.0,) * 3
         socket.description = "Light coefficient, RGB; k = l*(l+1)+m"
     group.interface.new_socket("Shader", in_out="OUTPUT", socket_type="NodeSocketShader")
-
-    def add(kind: str, x: float, y: float) -> bpy.types.Node:
-        node = group.nodes.new(kind)
-        node.location = (x, y)
-        node.hide = True
-        return node
-
-    inputs = add("NodeGroupInput", -800, 0)
+    inputs = _add(group, "NodeGroupInput", -800, 300)
     total = None
-    for index in range(attribute_count(order)):
-        attribute = add("ShaderNodeAttribute", -600, -200 * index)
-        attribute.attribute_type = "GEOMETRY"
-        attribute.attribute_name = f"{PREFIX}{index}"
-        split = add("ShaderNodeSeparateColor", -400, -200 * index)
-        group.links.new(attribute.outputs["Color"], split.inputs[0])
-        coefficients = [*split.outputs, attribute.outputs["Alpha"]]
-        for channel, coefficient in enumerate(coefficients[:terms - CHANNELS * index]):
+    for index, (colour, alpha) in enumerate(sources):
+        split = _add(group, "ShaderNodeSeparateColor", -400, -200 * index)
+        group.links.new(colour, split.inputs[0])
+        for channel, coefficient in enumerate([*split.outputs, alpha][:terms - CHANNELS * index]):
             k = CHANNELS * index + channel
-            term = add("ShaderNodeVectorMath", -200, -200 * index - 45 * channel)
+            term = _add(group, "ShaderNodeVectorMath", -200, -200 * index - 45 * channel)
             term.operation = "MULTIPLY" if total is None else "MULTIPLY_ADD"
             group.links.new(coefficient, term.inputs[0])
             group.links.new(inputs.outputs[f"L{k}"], term.inputs[1])
             if total is not None:
                 group.links.new(total, term.inputs[2])
             total = term.outputs[0]
-    coloured = add("ShaderNodeVectorMath", 0, 0)
+    coloured = _add(group, "ShaderNodeVectorMath", 0, 0)
     coloured.operation = "MULTIPLY"
     group.links.new(inputs.outputs["Albedo"], coloured.inputs[0])
     group.links.new(total, coloured.inputs[1])
-    emission = add("ShaderNodeEmission", 200, 0)
+    emission = _add(group, "ShaderNodeEmission", 200, 0)
     group.links.new(coloured.outputs[0], emission.inputs["Color"])
-    outputs = add("NodeGroupOutput", 400, 0)
+    outputs = _add(group, "NodeGroupOutput", 400, 0)
     group.links.new(emission.outputs[0], outputs.inputs["Shader"])
     group[_ORDER], group[_VERSION] = order, GROUP_VERSION

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from ..backend import spherical_harmonics as sh
 from ..backend.errors import UserError
-from .attributes import attribute_count, has_bake, read_record
-from .frames import bake_frame
+from ..backend.geometry import TEXEL
+from .attributes import attribute_count, check_whole, has_bake, read_record
+from .frames import as_array, bake_frame
+from .images import bake_images
 from .nodes import DEFAULT_ALBEDO, ensure_group, group_order, is_group, set_light
 
 _STATE = "neural_gash_preview"  # custom property of a preview material: what its slot held
@@ -32,18 +34,23 @@ def preview_on(obj: bpy.types.Object) -> None:
     """Show the bake of `obj`, lit by a white sky until `update_light`.
 
     Raises:
-        UserError: there is no bake, or a material's colour reads more attributes than EEVEE can
-            draw beside the bake's.
+        UserError: there is no bake, its images are not whole, or a material's colour reads more
+            attributes than EEVEE can draw beside the bake's.
     """
     record = read_record(obj)
+    if obj.mode != "EDIT":  # in which a mesh's attributes cannot be seen
+        check_whole(obj.data, record)
+    images = bake_images(obj.data, record) if record.domain == TEXEL else []
+    if images and record.uv_map not in obj.data.uv_layers:
+        raise UserError(f"The UV map '{record.uv_map}' of the bake of '{obj.name}' is gone; bake again.")
     preview_off(obj)
-    group = ensure_group(record.order)
+    group = ensure_group(record.order, images, record.uv_map if images else "")
     originals = [slot.material for slot in obj.material_slots] or [None]
     previews: list[bpy.types.Material] = []
     try:
         for original in originals:
             previews.append(_preview_material(original, group))
-            _check_attributes(original, previews[-1], record.order)
+            _check_attributes(original, previews[-1], record.order, 1 if images else attribute_count(record.order))
     except UserError:
         _remove_unused(previews)
         raise
@@ -95,7 +102,7 @@ def update_light(obj: bpy.types.Object, light: NDArray) -> None:
         UserError: the record of the bake is damaged.
         ValueError: the light is of a lower order than the bake.
     """
-    if not (is_on(obj) and has_bake(obj)):
+    if not (is_on(obj) and has_bake(obj)) or obj.library or not np.isfinite(as_array(obj.matrix_world)).all():
         return
     record = read_record(obj)
     terms = record.order ** 2
@@ -186,12 +193,11 @@ def _upstream(*sockets: bpy.types.NodeSocket) -> list[bpy.types.Node]:
     return list(found)
 
 
-def _check_attributes(original: bpy.types.Material | None, preview: bpy.types.Material, order: int) -> None:
+def _check_attributes(original: bpy.types.Material | None, preview: bpy.types.Material, order: int, bake: int) -> None:
     """UserError where the preview reads more of the mesh's attributes than EEVEE can draw."""
     output = preview.node_tree.get_output_node("ALL")
     reads = _mesh_reads(_upstream(output.inputs["Surface"]))
     if original is not None and len(reads) > EEVEE_ATTRIBUTES:
-        bake = attribute_count(order)
         raise UserError(f"The colour of the material '{original.name}' reads {len(reads) - bake} attributes "
                         f"of the mesh; with the {bake} of an order-{order} bake that is more than the "
                         f"{EEVEE_ATTRIBUTES} that EEVEE draws, so simplify it or bake at a lower order.")

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from ..backend.errors import UserError
 from ..backend.geometry import Surface, TriangleMesh, unit
 from .attributes import RECORD, discard
-from .evaluation import evaluated, revealed
+from .evaluation import evaluated, revealed, shown_objects
 from .frames import Array, as_array, bake_frame, rotation_part
 from .preview import preview_off
+from .uv_maps import read_uv
 
 SELF, VISIBLE = "SELF", "VISIBLE"
 # Stretch and places are compared to this part of their size: far above float32 noise of a turned
@@ -58,7 +59,7 @@ def refusal(obj: bpy.types.Object | None) -> str:
     if obj.data.override_library:
         return (f"The mesh of '{obj.name}' is a library override, which cannot store a bake; "
                 "make it local to bake it.")
-    if obj.mode == "EDIT":
+    if obj.data.is_editmode:  # its own mode, or that of another object with the same mesh
         return f"'{obj.name}' is in Edit Mode, which would discard the bake; leave Edit Mode to bake it."
     if not obj.data.polygons:
         return f"'{obj.name}' has no faces, so there is nothing to bake."
@@ -150,15 +151,16 @@ def read_occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgr
             for local, triangles, matrix in _occluders(obj, mode, depsgraph)]
 
 
-def fingerprint(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, occluder_mode: str = SELF) -> str:
+def fingerprint(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, occluder_mode: str = SELF,
+                uv_map: str = "") -> str:
     """What a bake of `obj` depends on, in a short text; compare two with `same_fingerprint`.
 
     Without other occluders it is the same wherever the object stands, however it is turned and
     uniformly scaled (none of which changes transfer). With them, what counts is where they stand
-    from the object.
+    from the object. With a texture's UV map, its coordinates count too.
 
     Raises:
-        UserError: as `read_object`.
+        UserError: as `read_object`, or there is no such UV map.
     """
     reason = refusal(obj)
     if reason:
@@ -175,6 +177,8 @@ def fingerprint(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, occluder_
             digest.update(local.tobytes())
             digest.update(_corner_vertices(mesh).tobytes())
             _hash_shading(mesh, digest)
+            if uv_map:
+                digest.update(read_uv(obj.data, uv_map).tobytes())
         finally:
             copy.to_mesh_clear()
     linear = matrix[:3, :3]
@@ -240,6 +244,7 @@ def _instances(depsgraph: bpy.types.Depsgraph, owners: set[int] | None, baked: b
     `baked` itself is left out, but instances of it elsewhere are not.
     """
     known: dict[tuple[int, int], tuple[NDArray, NDArray] | None] = {}
+    shown = shown_objects(depsgraph.view_layer) if owners is None else set()
     for instance in depsgraph.object_instances:
         solid = instance.object
         if solid.type != "MESH" or not instance.show_self:  # curves, texts and balls come as meshes too
@@ -247,7 +252,7 @@ def _instances(depsgraph: bpy.types.Depsgraph, owners: set[int] | None, baked: b
         owner = (instance.parent if instance.is_instance else solid).original
         if owner == baked and not instance.is_instance:
             continue
-        if owners is None and (owner.hide_render or solid.original.hide_render):
+        if owners is None and (owner.session_uid not in shown or solid.original.hide_render):
             continue
         if owners is not None and owner.session_uid not in owners:
             continue

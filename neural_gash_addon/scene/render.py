@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -60,9 +61,11 @@ def render_preview(objects: Sequence[bpy.types.Object], path: Path, *, camera: b
                                                                   "32" if exr else "8")
         scene.view_settings.view_transform = "Standard"
         render.use_file_extension = False
-        with atomic(path) as draft:
-            render.filepath = str(draft)
+        with tempfile.TemporaryDirectory(prefix="neural_gash-") as folder, atomic(path) as draft:
+            # written elsewhere first: Blender does not say when a disk is full, copying does
+            render.filepath = str(Path(folder) / f"render{path.suffix}")
             bpy.ops.render.render(scene=scene.name, write_still=True)
+            shutil.copyfile(render.filepath, draft)
     finally:
         for obj in hidden:
             obj.hide_render = True

@@ -11,7 +11,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..backend.errors import UserError
-from .attributes import has_bake, read_record
+from .attributes import check_whole, has_bake, read_record
 from .read import SELF, fingerprint, same_fingerprint
 
 CURRENT, STALE, NONE = "CURRENT", "STALE", "NONE"
@@ -39,8 +39,9 @@ def check(obj: bpy.types.Object) -> bool:
     """Compare the object with its bake now: whether the bake still fits. Main thread only."""
     try:
         record = read_record(obj)
-        now = fingerprint(obj, bpy.context.evaluated_depsgraph_get(), record.occluders)
+        now = fingerprint(obj, bpy.context.evaluated_depsgraph_get(), record.occluders, record.uv_map)
         current = same_fingerprint(now, record.fingerprint)
+        check_whole(obj.data, record)
     except UserError:  # changed so far that it could not be baked again as it was
         current = False
     _known[obj.session_uid] = CURRENT if current else STALE

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..backend import light as sh_light
 from ..backend import spherical_harmonics as sh
 from ..backend.errors import UserError
+from .evaluation import shown_objects
 
 Array = NDArray[np.float64]
 
@@ -28,6 +29,8 @@ def world_light(scene: bpy.types.Scene, order: int) -> Array:
     total = _background(scene.world, order)
     for direction, irradiance in _suns(scene):
         total += sh_light.sun(direction, irradiance, order)
+    if not np.isfinite(total).all():
+        raise UserError("The World or a sun lamp has a strength or colour that is infinite or not a number.")
     return total
 
 
@@ -144,10 +147,12 @@ def linear_pixels(image: bpy.types.Image) -> NDArray[np.float32]:
         raise UserError(f"The image '{image.name}' cannot be loaded from '{bpy.path.abspath(image.filepath)}'.")
     pixels = np.empty((height, width, image.channels), np.float32)
     image.pixels.foreach_get(pixels.ravel())
+    if image.channels == 4 and not image.is_float and image.alpha_mode == "STRAIGHT":
+        pixels[..., :3] *= pixels[..., 3:]  # before decoding, as Cycles does
     if image.channels < 3:  # grey, with or without alpha
         pixels = np.repeat(pixels[..., :1], 3, axis=2)
     space = image.colorspace_settings
-    if image.is_float or space.is_data or space.name.startswith("Linear"):
+    if image.is_float or space.is_data or space.name in ("Linear", "Linear Rec.709"):
         return pixels  # float images come in scene-linear, whatever they were stored in
     if space.name != "sRGB":
         raise UserError(f"The image '{image.name}' is in the colour space "
@@ -160,11 +165,13 @@ def _suns(scene: bpy.types.Scene) -> list[tuple[Array, Array]]:
     layer = bpy.context.view_layer if bpy.context.scene == scene else scene.view_layers[0]
     layer.update()
     suns = []
+    shown = shown_objects(layer)
     for instance in layer.depsgraph.object_instances:
         lamp = instance.object
         if lamp.type != "LIGHT" or lamp.data.type != "SUN":
             continue
-        if lamp.original.hide_render or not instance.show_self:
+        owner = (instance.parent if instance.is_instance else lamp).original
+        if owner.session_uid not in shown or lamp.original.hide_render or not instance.show_self:
             continue
         direction = np.array(instance.matrix_world, dtype=np.float64)[:3, 2]
         length = np.linalg.norm(direction)

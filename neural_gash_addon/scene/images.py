@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Transfer textures as Blender images: OpenEXR files, packed or beside the .blend, known to their mesh."""
+from __future__ import annotations
+
+import re
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+
+import bpy
+
+from ..backend import exr
+from ..backend.errors import UserError
+from ..backend.exchange import atomic, check_writable, reason
+from ..backend.record import BakeRecord
+from ..backend.texture import TextureTransfer, image_count
+
+_IMAGES = "neural_gash_images"  # custom property of the mesh: its transfer images by number
+_RECORD = "neural_gash"         # custom property of an image: the record of the bake it belongs to
+
+
+def make_images(name: str, transfer: TextureTransfer, folder: Path | None, half: bool) -> list[bpy.types.Image]:
+    """New images that hold a texture bake, four coefficients each.
+
+    Args:
+        folder: where the files go; they are packed into the .blend where not given.
+        half: 16 bits a channel instead of 32.
+    Raises:
+        UserError: files cannot be written there, or others' are in the way.
+    """
+    if folder is not None:
+        return _load(name, _write(name, transfer, folder, half), transfer.record, half)
+    with tempfile.TemporaryDirectory(prefix="neural_gash-") as temporary:
+        images = _load(name, _write(name, transfer, Path(temporary), half), transfer.record, half)
+        for image in images:
+            image.pack()
+            image.filepath_raw = f"//{Path(image.filepath_raw).name}"  # the file itself is going
+        return images
+
+
+def attach(data: bpy.types.Mesh, images: list[bpy.types.Image]) -> None:
+    """Make the images those of the mesh."""
+    data[_IMAGES] = {str(number): image for number, image in enumerate(images)}
+
+
+def detach(data: bpy.types.Mesh) -> None:
+    """Take the mesh its images, and remove those that nothing else uses."""
+    images = [image for image in _attached(data) if image is not None]
+    if _IMAGES in data:
+        del data[_IMAGES]
+    for image in images:
+        if _RECORD in image and image.users == 0:
+            bpy.data.images.remove(image)
+
+
+def bake_images(data: bpy.types.Mesh, record: BakeRecord) -> list[bpy.types.Image]:
+    """The images of the bake on a mesh.
+
+    Raises:
+        UserError: one is missing, cannot be loaded, has another size, or belongs to another bake.
+    """
+    images = [image for image in _attached(data) if image is not None]
+    if len(images) != image_count(record.order):
+        raise UserError(f"The bake of '{data.name}' has lost some of its images; bake again.")
+    for image in images:
+        if not image.packed_file:
+            path = Path(bpy.path.abspath(image.filepath))
+            if not path.is_file():
+                raise UserError(f"The image '{image.name}' of the bake is missing ('{path}'); bake again.")
+            text, _, _ = exr.read_record(path)
+            if text != image.get(_RECORD):
+                raise UserError(f"The file '{path}' is of another bake than the object's; bake again.")
+        if tuple(image.size) != (record.side, record.side):
+            raise UserError(f"The image '{image.name}' has {image.size[0]} x {image.size[1]} texels, "
+                            f"but the bake has {record.side} x {record.side}; bake again.")
+    return images
+
+
+def _attached(data: bpy.types.Mesh) -> list[bpy.types.Image | None]:
+    """The images of a mesh in their order; None for one that was deleted."""
+    stored = data.get(_IMAGES)
+    if not hasattr(stored, "keys"):
+        return []
+    return [image if isinstance(image := stored[key], bpy.types.Image) else None
+            for key in sorted(stored.keys(), key=int)]
+
+
+def _write(name: str, transfer: TextureTransfer, folder: Path, half: bool) -> list[Path]:
+    """Write the files, each in one step, and the record beside them."""
+    clean = re.sub(r"[^\w.-]+", "_", name) or "mesh"
+    paths = [folder / f"{clean}_prt_{number}.exr" for number in range(image_count(transfer.record.order))]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"The folder '{folder}' cannot be made ({reason(error)}).") from error
+    check_writable(paths[0])
+    for path in paths:
+        if path.exists():
+            try:
+                exr.read_record(path)
+            except UserError as error:
+                raise UserError(f"There is a file '{path}' that no bake made; choose another folder.") from error
+    side, filled, text = transfer.record.side, transfer.fill_map(), transfer.record.to_json()
+    try:
+        for number, path in enumerate(paths):
+            exr.write(path, transfer.image(number, filled).reshape(side, side, 4), text, half)
+        with atomic(folder / f"{clean}_prt.json") as draft:
+            draft.write_text(text + "\n")
+    except OSError as error:
+        raise UserError(f"The textures cannot be written to '{folder}' ({reason(error)}).") from error
+    return paths
+
+
+def _load(name: str, paths: list[Path], record: BakeRecord, half: bool) -> list[bpy.types.Image]:
+    """The files as images whose numbers mean themselves."""
+    images = []
+    for number, path in enumerate(paths):
+        image = bpy.data.images.load(str(path), check_existing=False)
+        image.name = f"{name} PRT {number}"
+        image.colorspace_settings.name = "Non-Color"
+        image.alpha_mode = "CHANNEL_PACKED"
+        image.use_half_precision = half
+        image[_RECORD] = record.to_json()
+        if bpy.data.is_saved:
+            with suppress(ValueError):  # another drive, on Windows
+                image.filepath = bpy.path.relpath(str(path))
+        images.append(image)
+    return images
