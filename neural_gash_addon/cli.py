@@ -18,8 +18,9 @@ import numpy as np
 from .backend import exchange, methods, shading
 from .backend import light as sh_light
 from .backend.errors import UserError
+from .backend.transfer import Transfer
 from .ops.job import finish, prepare, summary
-from .properties import COLLECTION, RAYS, TOLERANCE, NeuralGashSettings
+from .properties import COLLECTION, RAYS, RESOLUTION, TEXTURE, TOLERANCE, VERTICES, NeuralGashSettings
 from .scene import lighting
 from .scene.attributes import has_bake, read_record
 from .scene.preview import preview_on
@@ -55,6 +56,10 @@ def _parser() -> argparse.ArgumentParser:
     quality.add_argument("--tolerance", type=float, help="relative L2 error to reach (0.02)")
     bake.add_argument("--occluders", default="self", metavar="self|visible|COLLECTION",
                       help="what casts shadows on the object (self)")
+    bake.add_argument("--texture", type=int, metavar="SIDE", help="bake to a texture of SIDE x SIDE texels instead")
+    bake.add_argument("--uv-map", metavar="NAME", default="", help="of the mesh, for --texture; else one is made")
+    bake.add_argument("--textures", metavar="FOLDER", type=Path, help="write the textures as .exr there, not into OUT")
+    bake.add_argument("--half", action="store_true", help="textures of 16 bits a channel instead of 32")
     bake.add_argument("--out", metavar="OUT.blend", type=Path, help="save the file with the bake in it")
     bake.add_argument("--npz", metavar="OUT.npz", type=Path, help="save points and coefficients")
     bake.add_argument("--png", metavar="OUT.png", type=Path,
@@ -102,6 +107,10 @@ def main(argv: Sequence[str]) -> int:
 
 def _bake(arguments: argparse.Namespace) -> tuple[dict, str]:
     """`bake`."""
+    if arguments.texture is None and (arguments.uv_map or arguments.textures or arguments.half):
+        raise UserError("--uv-map, --textures and --half belong to a bake with --texture.")
+    if arguments.texture is not None and arguments.npz is not None:
+        raise UserError("--npz holds the points of a bake to vertices; a texture's are in its .exr files (--textures).")
     _open(arguments.input)
     obj = _choose([o for o in bpy.context.scene.objects if o.type == "MESH"], arguments.object, "mesh")
     settings = bpy.context.scene.neural_gash
@@ -119,21 +128,39 @@ def _bake(arguments: argparse.Namespace) -> tuple[dict, str]:
         settings.collection = bpy.data.collections.get(arguments.occluders)
         if settings.collection is None:
             raise UserError(f"There is no collection named '{arguments.occluders}' in the file.")
+    if arguments.texture is not None:
+        settings.target = TEXTURE
+        settings.sizing = RESOLUTION
+        _set(settings, "side", arguments.texture)
+        settings.uv_map, settings.half = arguments.uv_map, arguments.half
+        settings.texture_folder = str(arguments.textures.absolute()) if arguments.textures else ""
+    else:
+        settings.target = VERTICES
     if arguments.applied_copy:
         obj = make_applied_copy(obj, bpy.context.evaluated_depsgraph_get())
         bpy.context.view_layer.update()
-    job = prepare(bpy.context, obj, settings)
+    job = prepare(bpy.context, obj, settings, _tiles(arguments, obj.name))
     transfer = methods.run(job.baking, _progress_bar())
     record, warning = finish(bpy.context, job, transfer)
     if warning:
         print(f"neural_gash: {warning}", file=sys.stderr)
     if arguments.npz:
-        exchange.save_npz(arguments.npz.absolute(), job.mesh, type(transfer)(transfer.coefficients, record))
+        assert isinstance(transfer, Transfer)
+        exchange.save_npz(arguments.npz.absolute(), job.read.mesh, Transfer(transfer.coefficients, record))
     if arguments.png:
         render_preview([obj], arguments.png.absolute(), camera=bpy.context.scene.camera)
     if arguments.out:
         _save(arguments.out.absolute())
     return {"object": obj.name, **asdict(record)}, f"{obj.name}: {summary(record)}."
+
+
+def _tiles(arguments: argparse.Namespace, name: str) -> Path | None:
+    """Beside the first output: finished tiles of a large texture, from which a killed bake goes on."""
+    output = next((p for p in (arguments.textures, arguments.out, arguments.npz, arguments.png) if p is not None), None)
+    if arguments.texture is None or output is None:
+        return None
+    clean = "".join(c if c.isalnum() else "_" for c in name)
+    return output.absolute().parent / f".{output.stem}-{clean}.tiles"
 
 
 def _relight(arguments: argparse.Namespace) -> tuple[dict, str]:
@@ -179,7 +206,7 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
     """UserError, before anything is computed, where its outcome could not be kept."""
     suffixes = {"out": (".blend",), "npz": (".npz",), "png": (".png", ".exr")}
     outputs = {name: path for name in suffixes if (path := getattr(arguments, name, None)) is not None}
-    if not outputs and not arguments.json:
+    if not outputs and not arguments.json and getattr(arguments, "textures", None) is None:
         options = "--out, --npz, --png or --json" if arguments.command == "bake" else "--png, --npz or --json"
         raise UserError(f"Nothing of this would be kept; add {options}.")
     for name, path in outputs.items():

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
 from .backend.estimator import MAX_RAYS
 from .backend.methods import METHODS, MIN_ORDER, MIN_TOLERANCE
 from .backend.spherical_harmonics import MAX_ORDER
+from .backend.texture import MAX_SIDE, MIN_SIDE
 from .scene.lighting import apply_light
 from .scene.read import SELF, VISIBLE
 
 RAYS, TOLERANCE, COLLECTION = "RAYS", "TOLERANCE", "COLLECTION"
+VERTICES, TEXTURE, RESOLUTION, DENSITY = "VERTICES", "TEXTURE", "RESOLUTION", "DENSITY"
 
 
 def _light_changed(settings: NeuralGashSettings, _context: bpy.types.Context) -> None:
@@ -49,6 +51,32 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
                (COLLECTION, "Collection", "The objects of a collection cast shadows")])
     collection: PointerProperty(  # type: ignore[valid-type]
         name="Collection", description="Whose objects cast shadows", type=bpy.types.Collection)
+    target: EnumProperty(  # type: ignore[valid-type]
+        name="Target", description="Where the bake is kept", default=VERTICES,
+        items=[(VERTICES, "Vertices", "Numbers at the vertices: quick, and enough for dense meshes"),
+               (TEXTURE, "Texture", "Images with a UV map of their own: fine shadows on large faces, and normal maps")])
+    sizing: EnumProperty(  # type: ignore[valid-type]
+        name="Size", description="What decides the size of the texture", default=RESOLUTION,
+        items=[(RESOLUTION, "Resolution", "A number of texels a side"),
+               (DENSITY, "Density", "A number of texels a metre; the texture is as large as that takes")])
+    side: IntProperty(  # type: ignore[valid-type]
+        name="Resolution", default=1024, min=MIN_SIDE, max=MAX_SIDE, subtype="PIXEL",
+        description="Width and height of the texture in texels")
+    texels_per_metre: FloatProperty(  # type: ignore[valid-type]
+        name="Texels per Metre", default=100.0, min=0.001, soft_max=10000.0,
+        description="Texels along a metre of the surface")
+    padding: IntProperty(  # type: ignore[valid-type]
+        name="Padding", default=2, min=1, max=64, subtype="PIXEL",
+        description="Texels between the parts of the UV map; more keeps them apart also from afar")
+    uv_map: StringProperty(  # type: ignore[valid-type]
+        name="UV Map", default="",
+        description="A UV map of the mesh to bake to, in which no faces overlap; leave empty to have one made")
+    half: BoolProperty(  # type: ignore[valid-type]
+        name="16 Bits", default=False,
+        description="Store half as much for each texel, exact to a thousandth; 32 bits keep every digit")
+    texture_folder: StringProperty(  # type: ignore[valid-type]
+        name="Folder", default="", subtype="DIR_PATH",
+        description="Where to write the textures as OpenEXR files; leave empty to pack them into the .blend file")
     light_rotation: FloatProperty(  # type: ignore[valid-type]
         name="Rotation", default=0.0, subtype="ANGLE", soft_min=-math.pi, soft_max=math.pi,
         description="Turn the light of the previews about the vertical axis", update=_light_changed)

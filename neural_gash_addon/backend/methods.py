@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from .raycast import Geometry, Occluders
 from .record import BakeRecord
 from .transfer import Transfer
 
+Result = TypeVar("Result")
 Baking = Generator[float, None, Transfer]
 MIN_ORDER = 2
 MIN_TOLERANCE = 1e-4
@@ -92,7 +94,7 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
                       scene=scene)
 
 
-def run(baking: Baking, progress: Callable[[float], None] | None = None) -> Transfer:
+def run(baking: Generator[float, None, Result], progress: Callable[[float], None] | None = None) -> Result:
     """Drive a bake to its end, calling `progress` with the share done (0 to 1)."""
     try:
         while True:

@@ -2,7 +2,9 @@
 """The Bake operator: at once from scripts, in the background of an open window."""
 from __future__ import annotations
 
+import hashlib
 import threading
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import bpy
@@ -10,6 +12,7 @@ import bpy
 from ..backend.errors import UserError
 from ..backend.methods import METHODS
 from ..backend.record import BakeRecord
+from ..backend.texture import TextureTransfer
 from ..backend.transfer import Transfer
 from ..scene.read import make_applied_copy, refusal
 from . import state
@@ -26,7 +29,7 @@ class Worker(threading.Thread):
         self._baking = job.baking
         self._cancelled = threading.Event()
         self.progress = 0.0
-        self.transfer: Transfer | None = None
+        self.transfer: Transfer | TextureTransfer | None = None
         self.error: Exception | None = None
 
     def run(self) -> None:
@@ -69,7 +72,8 @@ class _Baking:
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         """Read the scene, and bake beside the window."""
         try:
-            job = prepare(context, self._begin(context), context.scene.neural_gash)
+            obj = self._begin(context)
+            job = prepare(context, obj, context.scene.neural_gash, _tiles(obj))
         except UserError as error:
             return self._fail(context, error)
         self._job, self._worker = job, Worker(job)
@@ -132,6 +136,15 @@ class _Baking:
         if warning:
             self.report({"WARNING"}, warning)
         return {"FINISHED"}
+
+
+def _tiles(obj: bpy.types.Object | None) -> Path | None:
+    """Where an extension may keep the tiles of a texture that is being baked; None where this is none."""
+    package = __package__.rpartition(".")[0]
+    if obj is None or not package.startswith("bl_ext."):
+        return None
+    name = hashlib.blake2b(f"{bpy.data.filepath}|{obj.name}".encode(), digest_size=8).hexdigest()
+    return Path(bpy.utils.extension_path_user(package, path="tiles", create=True)) / name
 
 
 def _bake_refusal(context: bpy.types.Context) -> str:

@@ -2,21 +2,41 @@
 """One bake of one object: read the scene, bake arrays, write the scene. Operators, CLI and tests share it."""
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+import json
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import bpy
+import numpy as np
+from numpy.typing import NDArray
 
 from ..backend import methods
 from ..backend.errors import UserError
-from ..backend.geometry import TriangleMesh
-from ..backend.record import BakeRecord
+from ..backend.record import VERSION, BakeRecord
+from ..backend.texels import NormalMap
+from ..backend.texture import TextureTransfer, remove_tiles
+from ..backend.texture import bake as bake_texture
 from ..backend.transfer import Transfer
-from ..properties import COLLECTION, RAYS, NeuralGashSettings
-from ..scene.attributes import write_transfer
+from ..properties import COLLECTION, DENSITY, RAYS, TEXTURE, NeuralGashSettings
+from ..scene.attributes import read_record, write_textures, write_transfer
 from ..scene.lighting import apply_light, take_light
+from ..scene.normal_maps import read_normal_maps
 from ..scene.preview import preview_off, preview_on
-from ..scene.read import SELF, VISIBLE, fingerprint, read_object, read_occluders, refusal, same_fingerprint
+from ..scene.read import SELF, VISIBLE, SceneMesh, fingerprint, read_object, read_occluders, refusal, same_fingerprint
+from ..scene.uv_maps import check_room, read_uv
+
+
+@dataclass(frozen=True, eq=False)
+class TextureOptions:
+    """How a texture bake is kept."""
+
+    own_uv: bool         # the bake makes its UV map
+    uv_map: str          # of the person's, else ''
+    folder: Path | None  # None: packed
+    half: bool
+    tiles: Path | None   # where finished tiles wait for the rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,15 +45,23 @@ class Job:
 
     uid: int               # of the object; its name may change meanwhile
     name: str
-    mesh: TriangleMesh
-    baking: methods.Baking
+    read: SceneMesh
+    baking: Generator[float, None, Transfer | TextureTransfer]
     occluders: str
     fingerprint: str
     frame: tuple[float, ...]
+    texture: TextureOptions | None  # None: to vertices
 
 
-def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: NeuralGashSettings) -> Job:
-    """Read the object and what blocks its light. Raises UserError where that cannot be baked."""
+def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: NeuralGashSettings,
+            tiles: Path | None = None) -> Job:
+    """Read the object and what blocks its light.
+
+    Args:
+        tiles: a folder for the finished tiles of a texture, from which a bake that was killed goes on.
+    Raises:
+        UserError: that cannot be baked.
+    """
     if obj is None:
         raise UserError(refusal(None))
     depsgraph = context.evaluated_depsgraph_get()
@@ -47,29 +75,76 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
                         "rename it.")
     occluders = read_occluders(obj, mode, depsgraph)
     by_rays = settings.quality == RAYS
-    baking = methods.bake(
-        read.mesh, settings.method, settings.order, occluders=occluders,
-        rays=settings.rays if method.traces and by_rays else None,
-        tolerance=settings.tolerance if method.traces and not by_rays else None)
-    return Job(obj.session_uid, obj.name, read.mesh, baking, mode, fingerprint(obj, depsgraph, mode), read.frame)
+    rays = settings.rays if method.traces and by_rays else None
+    tolerance = settings.tolerance if method.traces and not by_rays else None
+    texture = None
+    uv = None
+    baking: Generator[float, None, Transfer | TextureTransfer]
+    if settings.target == TEXTURE:
+        if settings.uv_map:
+            uv = read_uv(obj.data, settings.uv_map)
+        folder = Path(bpy.path.abspath(settings.texture_folder)) if settings.texture_folder else None
+        if folder is not None and not folder.is_absolute():
+            raise UserError("The folder of the textures is beside a .blend file that has not been saved yet; "
+                            "save it first, or leave the folder empty.")
+        if uv is None:
+            check_room(obj.data)
+        texture = TextureOptions(uv is None, settings.uv_map, folder, settings.half, tiles)
+        dense = settings.sizing == DENSITY and uv is None
+        maps = read_normal_maps(obj, depsgraph, read.surface, read.matrix)
+        before = fingerprint(obj, depsgraph, mode, uv)
+        baking = bake_texture(
+            read.surface, settings.method, settings.order, uv=uv, side=None if dense else settings.side,
+            texels_per_metre=settings.texels_per_metre if dense else None, padding=settings.padding, rays=rays,
+            tolerance=tolerance, occluders=occluders, normal_maps=maps, folder=tiles,
+            key=_key(settings, before, read.matrix, maps))
+    else:
+        before = fingerprint(obj, depsgraph, mode)
+        baking = methods.bake(read.mesh, settings.method, settings.order, rays=rays, tolerance=tolerance,
+                              occluders=occluders)
+    return Job(obj.session_uid, obj.name, read, baking, mode, before, read.frame, texture)
 
 
-def finish(context: bpy.types.Context, job: Job, transfer: Transfer) -> tuple[BakeRecord, str]:
+def _key(settings: NeuralGashSettings, shape: str, matrix: NDArray, maps: Sequence[NormalMap]) -> str:
+    """What tells a texture bake from any other, in one text."""
+    digest = hashlib.blake2b(np.round(matrix, 6).tobytes(), digest_size=16)
+    for normal_map in maps:
+        digest.update(normal_map.image.tobytes() + normal_map.uv.tobytes() + str(normal_map.strength).encode())
+    chosen = {name: getattr(settings, name) for name in
+              ("method", "order", "quality", "rays", "tolerance", "sizing", "side", "texels_per_metre", "padding")}
+    return json.dumps({"version": VERSION, "shape": shape, "place": digest.hexdigest(), **chosen}, sort_keys=True)
+
+
+def finish(context: bpy.types.Context, job: Job, transfer: Transfer | TextureTransfer) -> tuple[BakeRecord, str]:
     """Write the bake, light it from the World and show it.
 
     Returns:
         The record, and a sentence to warn with ('' where all is well).
     Raises:
-        UserError: the object is gone or has changed meanwhile, or holds attributes in the way.
+        UserError: the object is gone or has changed meanwhile, holds attributes in the way, or files
+            cannot be written.
     """
     obj = next((o for o in bpy.data.objects if o.session_uid == job.uid), None)
     if obj is None:
         raise UserError(f"'{job.name}' was deleted while it was being baked.")
-    now = fingerprint(obj, context.evaluated_depsgraph_get(), job.occluders)
+    depsgraph = context.evaluated_depsgraph_get()
+    uv_map = job.texture.uv_map if job.texture else ""
+    now = fingerprint(obj, depsgraph, job.occluders, read_uv(obj.data, uv_map) if uv_map else None)
     if not same_fingerprint(now, job.fingerprint):
         raise UserError(f"'{obj.name}' or what shadows it was changed during the bake; bake again.")
-    record = replace(transfer.record, occluders=job.occluders, fingerprint=job.fingerprint, frame=job.frame)
-    write_transfer(obj, job.mesh, replace(transfer, record=record))
+    record = replace(transfer.record, occluders=job.occluders, fingerprint=now, frame=job.frame, uv_map=uv_map)
+    if isinstance(transfer, TextureTransfer):
+        assert job.texture is not None
+        if job.texture.own_uv:
+            record = replace(record, fingerprint=fingerprint(obj, depsgraph, job.occluders,
+                                                             transfer.uv.astype(np.float32)))
+        write_textures(obj, replace(transfer, record=record), own_uv=job.texture.own_uv, folder=job.texture.folder,
+                       half=job.texture.half)
+        if job.texture.tiles is not None:
+            remove_tiles(job.texture.tiles)
+    else:
+        write_transfer(obj, job.read.mesh, replace(transfer, record=record))
+    record = read_record(obj)
     warning = ""
     try:
         take_light(context.scene)
@@ -93,7 +168,8 @@ def bake_object(context: bpy.types.Context, obj: bpy.types.Object | None, settin
 
 def summary(record: BakeRecord) -> str:
     """One line for the report: points, time, rays, estimated error."""
-    text = f"Baked {record.points:,} points in {record.seconds:.2f} s"
+    what = f"{record.side} x {record.side} texels" if record.side else f"{record.points:,} points"
+    text = f"Baked {what} in {record.seconds:.2f} s"
     if record.rays:
         text += f", {record.rays_per_point:.0f} rays a point"
     if record.error_estimate is not None:

@@ -11,7 +11,7 @@ from ..backend.methods import METHODS
 from ..backend.record import BakeRecord
 from ..ops import state
 from ..ops.job import percent
-from ..properties import COLLECTION, RAYS
+from ..properties import COLLECTION, DENSITY, RAYS, TEXTURE, NeuralGashSettings
 from ..scene import staleness
 from ..scene.attributes import RECORD, has_bake
 from ..scene.preview import is_on
@@ -71,6 +71,8 @@ class NEURAL_GASH_PT_main(_Panel, bpy.types.Panel):
         label = METHODS[record.method].label if record.method in METHODS else record.method
         column = box.column(align=True)
         column.label(text=f"{label}, order {record.order}, {record.points:,} points")
+        if record.side:
+            column.label(text=f"Texture: {record.side} x {record.side}, UV map {record.uv_map}")
         column.label(text=f"Time: {record.seconds:.2f} s")
         if record.rays:
             column.label(text=f"Rays: {record.rays_per_point:.0f} a point")
@@ -117,6 +119,22 @@ class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):
             layout.prop(settings, "occluders")
             if settings.occluders == COLLECTION:
                 layout.prop(settings, "collection")
+        layout.prop(settings, "target", expand=True)
+        if settings.target == TEXTURE:
+            self._texture(layout, settings, context.object)
+
+    def _texture(self, layout: bpy.types.UILayout, settings: NeuralGashSettings, obj: bpy.types.Object | None) -> None:
+        """What a texture has beside."""
+        if obj is not None and obj.type == "MESH":
+            layout.prop_search(settings, "uv_map", obj.data, "uv_layers")
+        if not settings.uv_map:
+            layout.prop(settings, "sizing", expand=True)
+        by_density = settings.sizing == DENSITY and not settings.uv_map
+        layout.prop(settings, "texels_per_metre" if by_density else "side")
+        if not settings.uv_map:
+            layout.prop(settings, "padding")
+        layout.prop(settings, "half")
+        layout.prop(settings, "texture_folder")
 
 
 CLASSES = (NEURAL_GASH_PT_main, NEURAL_GASH_PT_light, NEURAL_GASH_PT_settings)

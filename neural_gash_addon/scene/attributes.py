@@ -78,14 +78,12 @@ def write_transfer(obj: bpy.types.Object, mesh: TriangleMesh, transfer: Transfer
 
 
 def write_textures(obj: bpy.types.Object, transfer: TextureTransfer, *, own_uv: bool, folder: Path | None, half: bool
-                   ) -> str:
+                   ) -> None:
     """Store a texture bake on the object's mesh in place of any earlier bake.
 
     Args:
         own_uv: the UVs are an atlas of the bake's own, which becomes a UV map of the mesh.
         folder, half: see `images.make_images`.
-    Returns:
-        The name of the UV map.
     Raises:
         UserError: as `write_transfer`, or the files or the UV map cannot be made; nothing has changed then.
     """
@@ -101,12 +99,6 @@ def write_textures(obj: bpy.types.Object, transfer: TextureTransfer, *, own_uv: 
     attach(data, images)
     data[RECORD] = replace(transfer.record, uv_map=uv_map).to_json()
     data.update_tag()
-    return uv_map
-
-
-def set_fingerprint(obj: bpy.types.Object, fingerprint: str) -> None:
-    """Put the fingerprint into the record of the bake on the object's mesh."""
-    obj.data[RECORD] = replace(read_record(obj), fingerprint=fingerprint).to_json()
 
 
 def _check_mode(obj: bpy.types.Object) -> None:

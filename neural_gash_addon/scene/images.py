@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tempfile
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -44,13 +45,17 @@ def attach(data: bpy.types.Mesh, images: list[bpy.types.Image]) -> None:
 
 
 def detach(data: bpy.types.Mesh) -> None:
-    """Take the mesh its images, and remove those that nothing else uses."""
+    """Take the mesh its images; a preview may show them until it goes."""
     images = [image for image in _attached(data) if image is not None]
     if _IMAGES in data:
         del data[_IMAGES]
-    for image in images:
-        if _RECORD in image and image.users == 0:
-            bpy.data.images.remove(image)
+    remove_unused(images)
+
+
+def remove_unused(images: Iterable[bpy.types.Image]) -> None:
+    """Delete those of some images that a bake made and nothing uses any more."""
+    for image in [i for i in images if _RECORD in i and i.users == 0]:
+        bpy.data.images.remove(image)
 
 
 def bake_images(data: bpy.types.Mesh, record: BakeRecord) -> list[bpy.types.Image]:

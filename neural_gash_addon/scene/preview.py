@@ -16,7 +16,7 @@ from ..backend.errors import UserError
 from ..backend.geometry import TEXEL
 from .attributes import attribute_count, check_whole, has_bake, read_record
 from .frames import as_array, bake_frame
-from .images import bake_images
+from .images import bake_images, remove_unused
 from .nodes import DEFAULT_ALBEDO, ensure_group, group_order, is_group, set_light
 
 _STATE = "neural_gash_preview"  # custom property of a preview material: what its slot held
@@ -150,7 +150,7 @@ def _preview_material(original: bpy.types.Material | None, group: bpy.types.Node
         preview.name = f"{original.name} (PRT preview)"
         preview.use_fake_user = False
         preview.asset_clear()
-        source = _colour_socket(preview.node_tree)
+        source = _colour_socket(preview)
         colour = (DEFAULT_ALBEDO,) * 3 + (1.0,) if source is None else tuple(source.default_value)
     tree = preview.node_tree
     for node in [n for n in tree.nodes if n.type == "OUTPUT_MATERIAL"]:
@@ -168,15 +168,21 @@ def _preview_material(original: bpy.types.Material | None, group: bpy.types.Node
     return preview
 
 
-def _colour_socket(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket | None:
-    """The colour input of the first Principled or Diffuse shader that reaches the output."""
+def shader_node(material: bpy.types.Material | None) -> bpy.types.Node | None:
+    """The first Principled or Diffuse shader that reaches the output of a material."""
+    if material is None or not _has_nodes(material) or material.node_tree is None:
+        return None
+    tree = material.node_tree
     output = next((o for o in map(tree.get_output_node, ("ALL", "EEVEE", "CYCLES")) if o is not None), None)
     if output is None:
         return None
-    for node in _upstream(output.inputs["Surface"]):
-        if node.type in _COLOUR_SOCKETS:
-            return node.inputs[_COLOUR_SOCKETS[node.type]]
-    return None
+    return next((node for node in _upstream(output.inputs["Surface"]) if node.type in _COLOUR_SOCKETS), None)
+
+
+def _colour_socket(material: bpy.types.Material) -> bpy.types.NodeSocket | None:
+    """The colour input of a material's shader."""
+    node = shader_node(material)
+    return None if node is None else node.inputs[_COLOUR_SOCKETS[node.type]]
 
 
 def _upstream(*sockets: bpy.types.NodeSocket) -> list[bpy.types.Node]:
@@ -242,9 +248,10 @@ def _remove_slot(obj: bpy.types.Object) -> None:
 
 
 def _remove_unused(previews) -> None:
-    """Delete preview materials and shading groups that nothing uses any more."""
+    """Delete preview materials, shading groups and images of bakes that nothing uses any more."""
     for material in previews:
         if material.users == 0:
             bpy.data.materials.remove(material)
     for group in [g for g in bpy.data.node_groups if is_group(g) and g.users == 0]:
         bpy.data.node_groups.remove(group)
+    remove_unused(bpy.data.images)

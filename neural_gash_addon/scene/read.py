@@ -17,7 +17,6 @@ from .attributes import RECORD, discard
 from .evaluation import evaluated, revealed, shown_objects
 from .frames import Array, as_array, bake_frame, rotation_part
 from .preview import preview_off
-from .uv_maps import read_uv
 
 SELF, VISIBLE = "SELF", "VISIBLE"
 # Stretch and places are compared to this part of their size: far above float32 noise of a turned
@@ -152,15 +151,15 @@ def read_occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgr
 
 
 def fingerprint(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, occluder_mode: str = SELF,
-                uv_map: str = "") -> str:
+                uv: NDArray[np.float32] | None = None) -> str:
     """What a bake of `obj` depends on, in a short text; compare two with `same_fingerprint`.
 
     Without other occluders it is the same wherever the object stands, however it is turned and
     uniformly scaled (none of which changes transfer). With them, what counts is where they stand
-    from the object. With a texture's UV map, its coordinates count too.
+    from the object. A texture's UVs (C, 2) count too.
 
     Raises:
-        UserError: as `read_object`, or there is no such UV map.
+        UserError: as `read_object`.
     """
     reason = refusal(obj)
     if reason:
@@ -177,8 +176,8 @@ def fingerprint(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, occluder_
             digest.update(local.tobytes())
             digest.update(_corner_vertices(mesh).tobytes())
             _hash_shading(mesh, digest)
-            if uv_map:
-                digest.update(read_uv(obj.data, uv_map).tobytes())
+            if uv is not None:
+                digest.update(uv.tobytes())
         finally:
             copy.to_mesh_clear()
     linear = matrix[:3, :3]

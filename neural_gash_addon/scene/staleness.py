@@ -13,6 +13,7 @@ from bpy.app.handlers import persistent
 from ..backend.errors import UserError
 from .attributes import check_whole, has_bake, read_record
 from .read import SELF, fingerprint, same_fingerprint
+from .uv_maps import read_uv
 
 CURRENT, STALE, NONE = "CURRENT", "STALE", "NONE"
 _DELAY = 0.5  # seconds
@@ -39,7 +40,8 @@ def check(obj: bpy.types.Object) -> bool:
     """Compare the object with its bake now: whether the bake still fits. Main thread only."""
     try:
         record = read_record(obj)
-        now = fingerprint(obj, bpy.context.evaluated_depsgraph_get(), record.occluders, record.uv_map)
+        uv = read_uv(obj.data, record.uv_map) if record.uv_map else None
+        now = fingerprint(obj, bpy.context.evaluated_depsgraph_get(), record.occluders, uv)
         current = same_fingerprint(now, record.fingerprint)
         check_whole(obj.data, record)
     except UserError:  # changed so far that it could not be baked again as it was

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The tangent-space normal maps of an object's materials, for bakes to textures."""
+from __future__ import annotations
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..backend.errors import UserError
+from ..backend.geometry import Surface
+from ..backend.texels import NormalMap
+from .evaluation import evaluated
+from .frames import Array
+from .preview import shader_node
+from .uv_maps import read_uv
+from .world import linear_pixels
+
+
+def read_normal_maps(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, surface: Surface, matrix: Array
+                     ) -> list[NormalMap]:
+    """What the Normal Map nodes of the object's materials say, as far as a bake can follow them.
+
+    Args:
+        surface, matrix: the object as it was read for the bake.
+    Raises:
+        UserError: a normal map's image or UV map cannot be read.
+    """
+    found = [(slot, node) for slot, item in enumerate(obj.material_slots)
+             if (node := _normal_node(item.material)) is not None]
+    if not found:
+        return []
+    slots = np.zeros(int(surface.corner_faces.max()) + 1, np.int32)
+    maps = []
+    with evaluated(obj, depsgraph) as copy:
+        mesh = copy.to_mesh()
+        try:
+            mesh.polygons.foreach_get("material_index", slots)
+            slots = np.clip(slots, 0, len(obj.material_slots) - 1)
+            for slot, node in found:
+                name = node.uv_map or _rendered_uv(obj.data)
+                uv = read_uv(obj.data, name)
+                maps.append(NormalMap(_pixels(obj.material_slots[slot].material, node),
+                                      float(node.inputs["Strength"].default_value),
+                                      slots[surface.polygons] == slot, uv, _tangents(obj.name, mesh, name, matrix)))
+        finally:
+            copy.to_mesh_clear()
+    return maps
+
+
+def _normal_node(material: bpy.types.Material | None) -> bpy.types.Node | None:
+    """The Normal Map node that feeds the shader of a material, if it is one that reads an image by UV."""
+    shader = shader_node(material)
+    if shader is None or not shader.inputs["Normal"].is_linked:
+        return None
+    node = shader.inputs["Normal"].links[0].from_node
+    usable = (node.type == "NORMAL_MAP" and node.space == "TANGENT" and not node.mute
+              and not node.inputs["Strength"].is_linked and node.inputs["Color"].is_linked
+              and node.inputs["Color"].links[0].from_node.type == "TEX_IMAGE")
+    return node if usable else None
+
+
+def _pixels(material: bpy.types.Material, node: bpy.types.Node) -> NDArray[np.float32]:
+    """(H, W, 3) of the node's image."""
+    image = node.inputs["Color"].links[0].from_node.image
+    if image is None:
+        raise UserError(f"The normal map of the material '{material.name}' has no image.")
+    try:
+        return np.ascontiguousarray(linear_pixels(image)[..., :3])
+    except UserError as error:
+        raise UserError(f"The normal map of the material '{material.name}' cannot be read: {error}") from error
+
+
+def _rendered_uv(data: bpy.types.Mesh) -> str:
+    """Name of the UV map that renders use where none is named; '' where there is none."""
+    return next((layer.name for layer in data.uv_layers if layer.active_render), "")
+
+
+def _tangents(name: str, mesh: bpy.types.Mesh, uv_map: str, matrix: Array) -> NDArray[np.float32]:
+    """(C, 4) MikkTSpace tangents in world axes, and the signs of their bitangents there."""
+    try:
+        mesh.calc_tangents(uvmap=uv_map)
+    except RuntimeError as error:
+        raise UserError(f"'{name}' has faces of more than four corners, for which Blender computes no tangents; "
+                        "triangulate them to bake with a normal map.") from error
+    out = np.empty((len(mesh.loops), 4), np.float32)
+    directions, signs = np.empty((len(mesh.loops), 3), np.float32), np.empty(len(mesh.loops), np.float32)
+    mesh.loops.foreach_get("tangent", directions.ravel())
+    mesh.loops.foreach_get("bitangent_sign", signs)
+    linear = matrix[:3, :3]
+    turned = directions @ linear.T
+    out[:, :3] = turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-30)
+    out[:, 3] = signs * np.sign(np.linalg.det(linear))
+    return out
