@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Texture bakes from the command line; one that is killed goes on where it was."""
+from __future__ import annotations
+
+import json
+import subprocess
+import time
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from .conftest import ROOT, command
+
+
+def _pixels(folder):
+    return [oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT) for path in sorted(folder.glob("*.exr"))]
+
+
+def test_textures_beside_a_file(run, blend, tmp_path):
+    done = run("bake", blend, "--object", "Ring", "--texture", 64, "--rays", 16, "--textures", tmp_path / "maps",
+               "--out", tmp_path / "out.blend", "--png", tmp_path / "out.png", "--json")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout.splitlines()[-1])
+    assert (report["target"], report["side"], report["uv_map"], report["order"]) == ("texture", 64, "PRT", 3)
+    assert [p.shape for p in _pixels(tmp_path / "maps")] == [(64, 64, 4)] * 3
+    assert json.loads((tmp_path / "maps" / "Ring_prt.json").read_text())["rays"] == report["rays"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["maps", "out.blend", "out.png"]
+    relit = run("relight", tmp_path / "out.blend", "--object", "Ring", "--png", tmp_path / "relit.png")
+    assert relit.returncode == 0, relit.stderr
+
+
+def test_options_that_do_not_fit_are_refused(refused, blend, tmp_path):
+    out = tmp_path / "out.blend"
+    assert "--texture" in refused("bake", blend, "--object", "Ring", "--half", "--out", out)
+    assert "--npz" in refused("bake", blend, "--object", "Ring", "--texture", 64, "--npz", tmp_path / "a.npz")
+    assert "resolution" in refused("bake", blend, "--object", "Ring", "--texture", 5, "--out", out)
+    assert "no UV map" in refused("bake", blend, "--object", "Ring", "--texture", 64, "--uv-map", "X", "--out", out)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kills", [2])
+def test_a_killed_bake_goes_on_and_gives_the_same_bytes(run, ply, tmp_path, kills):
+    def arguments(folder):
+        return ("bake", ply, "--texture", 1024, "--order", 2, "--rays", 64, "--textures", folder / "maps", "--json")
+
+    whole, torn = tmp_path / "whole", tmp_path / "torn"
+    whole.mkdir()
+    torn.mkdir()
+    assert run(*arguments(whole)).returncode == 0
+    tiles = torn / ".maps-ring.tiles"
+    for count in range(1, kills + 1):
+        process = subprocess.Popen(command(*arguments(torn)), cwd=ROOT, stdout=subprocess.DEVNULL,
+                                   stderr=subprocess.DEVNULL)
+        try:
+            while len(list(tiles.glob("0*.json"))) < count:
+                assert process.poll() is None
+                time.sleep(0.02)
+        finally:
+            process.kill()
+            process.wait()
+    done = {path: path.stat().st_mtime_ns for path in tiles.glob("0*.json")}
+    assert 1 < len(done) < 4 and not (torn / "maps").exists()
+    again = run(*arguments(torn))
+    assert again.returncode == 0, again.stderr
+    for a, b in zip(_pixels(whole / "maps"), _pixels(torn / "maps"), strict=True):
+        assert np.array_equal(a, b)
+    assert [p.name for p in torn.iterdir()] == ["maps"]
