@@ -11,12 +11,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import ambient
 import equal_error
 import memory
+import textures
 import throughput
 from table import Table, machine
 
 from neural_gash_addon.backend.estimator import default_threads
 
-PARTS = ("throughput", "memory", "error", "job", "ambient")
+PARTS = ("throughput", "memory", "error", "job", "ambient", "texture")
 
 
 def main() -> int:
@@ -39,6 +40,8 @@ def main() -> int:
         equal_error.measure_whole_job(table, threads, args.quick)
     if "ambient" in parts:
         ambient.measure(table, threads)
+    if "texture" in parts:
+        textures.measure(table, threads, args.quick)
     missed = table.missed()
     print(f"\n{len(missed)} target(s) missed" + "".join(f"\n- {row}" for row in missed))
     return 1 if missed else 0

@@ -97,7 +97,8 @@ def main(argv: Sequence[str]) -> int:
         print(f"neural_gash: {error}", file=sys.stderr)
         return BAD_INPUT
     except OSError as error:  # no room, a name too long, a pipe that closed
-        print(f"neural_gash: {error.filename or 'a file'} cannot be written: {exchange.reason(error)}.", file=sys.stderr)
+        name = error.filename or "a file"
+        print(f"neural_gash: {name} cannot be written: {exchange.reason(error)}.", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
         print("neural_gash: interrupted", file=sys.stderr)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from .errors import UserError
 
+CHECKED_SIDE = 1024   # at which overlaps are looked for: a finer look would find slivers that no one sees
 _REACH = 2 ** 0.5     # texels: a bilinear lookup reads texels whose centre is less than 1 away in x and in y
 _STEP = 0.5           # texels between the samples of an outline that find the texels beside it
 _FARTHEST = 1.0       # barycentric coordinates of centres outside a sliver run away; normals must not

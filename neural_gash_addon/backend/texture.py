@@ -15,17 +15,15 @@ from . import methods
 from .errors import UserError
 from .exchange import atomic, reason
 from .geometry import Surface
-from .raster import Layout
+from .raster import CHECKED_SIDE, Layout
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
 from .texels import NormalMap, fill_map, texel_points
-from .unwrap import unwrap
+from .unwrap import Atlas, unwrap
 
 CHANNELS = 4             # coefficients that one image holds
 MIN_SIDE, MAX_SIDE = 16, 8192
-_CHECKED = 1024          # a side at which overlaps are looked for; more would find slivers that no one sees
 _ATLAS_SHARE = 0.1       # of the progress
-_REPAIRS = 3             # times that faces over each other are laid out anew, each alone
 _TILE = 1 << 18          # texels of a tile, covered or not: some seconds of work
 _OURS = re.compile(r"\d{4}\.(npy|json)")
 _JOB = "job.json"
@@ -87,9 +85,10 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
     start_at = 0.0
     if uv is None:
         start_at = _ATLAS_SHARE
-        uv, side = yield from _atlas(surface, side, texels_per_metre, padding)
+        atlas = yield from _scaled(unwrap(surface, side=side, texels_per_metre=texels_per_metre, padding=padding))
+        uv, side = atlas.uv, atlas.side
         _check_side(side, None)
-    elif len(pairs := Layout(uv[surface.corners], surface.triangles, min(side or 0, _CHECKED)).overlapping()):
+    elif len(pairs := Layout(uv[surface.corners], surface.triangles, min(side or 0, CHECKED_SIDE)).overlapping()):
         raise UserError(overlap_message(pairs, surface.polygons))
     assert side is not None
     layout = Layout(uv[surface.corners], surface.triangles, side)
@@ -137,24 +136,15 @@ def _check_side(side: int | None, texels_per_metre: float | None) -> None:
         raise UserError(f"The resolution must be {MIN_SIDE} to {MAX_SIDE} texels, not {side}.")
 
 
-def _atlas(surface: Surface, side: int | None, texels_per_metre: float | None, padding: int
-           ) -> Generator[float, None, tuple[NDArray, int]]:
-    """UVs (C, 2) of the surface's own, and their side."""
-    apart = np.zeros(len(surface.corners), bool)
-    for _ in range(_REPAIRS):
-        unwrapping = unwrap(surface, side=side, texels_per_metre=texels_per_metre, padding=padding, apart=apart)
-        try:
-            while True:
-                yield _ATLAS_SHARE * next(unwrapping)
-        except StopIteration as end:
-            atlas = end.value
-        finally:
-            unwrapping.close()
-        pairs = Layout(atlas.uv[surface.corners], surface.triangles, min(atlas.side, _CHECKED)).overlapping()
-        if not len(pairs):
-            break
-        apart[pairs.ravel()] = True  # charts that lie over themselves
-    return atlas.uv, atlas.side
+def _scaled(unwrapping: Generator[float, None, Atlas]) -> Generator[float, None, Atlas]:
+    """Unwrap as the first part of the bake."""
+    try:
+        while True:
+            yield _ATLAS_SHARE * next(unwrapping)
+    except StopIteration as end:
+        return end.value
+    finally:
+        unwrapping.close()
 
 
 def overlap_message(pairs: NDArray, polygons: NDArray) -> str:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from .errors import UserError
 from .estimator import morton_order
 from .geometry import Surface, unit
+from .raster import CHECKED_SIDE, Layout
 
 PIECE = 1000           # triangles that xatlas charts at a time: 40 ms at most
 _DRAFT_RESOLUTION = 16  # of a piece's own packing, which is thrown away
@@ -25,6 +26,7 @@ _FILLED = 0.65         # of the texture, at the first try of packing
 _BESIDE = 1.5          # texels that a chart takes beside its area and padding, each way
 _SHRINK = 0.94         # of the texels a metre, from one try to the next
 _TRIES = 16
+_REPAIRS = 3           # times that faces which lie over each other are laid out anew, each alone
 _FLAT = 1e-10          # of a face's area that is left in UVs: less, and it has collapsed
 
 
@@ -39,14 +41,14 @@ class Atlas:
 
 
 def unwrap(surface: Surface, *, side: int | None, texels_per_metre: float | None = None, padding: int = 2,
-           apart: NDArray[np.bool_] | None = None) -> Generator[float, None, Atlas]:
+           ) -> Generator[float, None, Atlas]:
     """Lay out the faces of a mesh in a square texture, without overlaps.
 
     Seams follow where normals split; the triangles of a polygon stay together.
 
     Args:
         side: texels a side, or None and texels_per_metre, which decides it.
-        padding: texels between charts. apart: (F,) triangles to lay out alone.
+        padding: texels between charts.
     Yields:
         Progress, 0 to 1.
     Raises:
@@ -57,6 +59,25 @@ def unwrap(surface: Surface, *, side: int | None, texels_per_metre: float | None
     except ImportError as error:
         raise UserError("Textures need the Python package xatlas, which this Blender's Python has not; "
                         "bake to vertices, or to a UV map of your own.") from error
+    apart = np.zeros(len(surface.corners), bool)
+    for number in range(_REPAIRS):
+        unwrapping = _unwrap(xatlas, surface, side, texels_per_metre, padding, apart)
+        try:
+            while True:
+                share = next(unwrapping)
+                yield 0.9 * share if not number else 0.9
+        except StopIteration as end:
+            atlas: Atlas = end.value
+        pairs = Layout(atlas.uv[surface.corners], surface.triangles, min(atlas.side, CHECKED_SIDE)).overlapping()
+        if not len(pairs):
+            break
+        apart[pairs.ravel()] = True  # charts that lie over themselves
+    return atlas
+
+
+def _unwrap(xatlas, surface: Surface, side: int | None, texels_per_metre: float | None, padding: int,
+            apart: NDArray[np.bool_]) -> Generator[float, None, Atlas]:
+    """`unwrap` once, with the polygons of the triangles `apart` (F,) laid out alone."""
     positions, triangles, corners = surface.positions, surface.triangles, surface.corners
     normals, polygons = surface.corner_normals, surface.polygons
     local = np.zeros((len(triangles), 3, 2))  # metres, each piece in a plane of its own
@@ -67,8 +88,7 @@ def unwrap(surface: Surface, *, side: int | None, texels_per_metre: float | None
         areas += found
         yield 0.8 * (number + 1) / len(pieces)
     alone = _torn(local, positions, triangles, corners, polygons)
-    if apart is not None:
-        alone |= np.isin(polygons, polygons[apart])
+    alone |= np.isin(polygons, polygons[apart])
     if alone.any():
         local[alone] = _laid_flat(positions[triangles[alone]], polygons[alone])
         pieces = [kept for piece in pieces if len(kept := piece[~alone[piece]])] + [np.flatnonzero(alone)]
