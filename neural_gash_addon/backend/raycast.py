@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,17 @@ _FARTHEST = 1e15  # of coordinates: Embree's boxes hold no more
 # Triangles handed to Embree at a time: its wrapper copies them holding the interpreter's lock, for
 # about 40 ms a piece, and a window must get a turn in between.
 PIECE = 1 << 15
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """The h rays that met something."""
+
+    rays: NDArray[np.int64]   # (h,) which
+    faces: NDArray[np.int64]  # (h,) triangle, counted over all parts that were given
+    u: NDArray[np.float32]    # (h,) barycentric coordinate of its second corner
+    v: NDArray[np.float32]    # (h,) and of its third
+    front: NDArray[np.bool_]  # (h,) the side from which its corners run counter-clockwise
 
 
 class Occluders:
@@ -47,10 +59,15 @@ class Occluders:
         self.scale = 1.0 / extent if extent > 0 else 1.0
         self.offset = max(OFFSET, RESOLUTION_STEPS * resolution * self.scale)
         self._scene = EmbreeScene(robust=True)  # watertight edges
+        first: list[int] = []  # triangle of each of Embree's geometries, counted over all parts
+        before = 0
         for positions, triangles in parts:
             for start in range(0, len(triangles), PIECE):
+                first.append(before + start)
                 used_here, piece = np.unique(triangles[start:start + PIECE], return_inverse=True)
                 EmbreeMesh(self._scene, self.normalise(positions[used_here]), piece.reshape(-1, 3))
+            before += len(triangles)
+        self._first = np.array(first, dtype=np.int64)
         # the first query commits the scene, which only one thread may do
         self.blocked(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))
 
@@ -68,3 +85,11 @@ class Occluders:
     def blocked(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.int32]:
         """0 where a ray is blocked, -1 where it is free. Both (R, 3) float32, contiguous. Releases the GIL."""
         return self._scene.run(origins, directions, query="OCCLUDED")
+
+    def hits(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> Hits:
+        """The first triangle that each ray (R, 3) meets. Releases the GIL."""
+        found = self._scene.run(origins, directions, query="INTERSECT", output=True)
+        rays = np.flatnonzero(found["primID"] >= 0)
+        faces = self._first[found["geomID"][rays]] + found["primID"][rays]
+        front = np.einsum("rx,rx->r", found["Ng"][rays], directions[rays]) < 0
+        return Hits(rays, faces, found["u"][rays], found["v"][rays], front)

@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Diffuse interreflection as transfer (Sloan 2002, section 5), in colour and valid under every light.
+
+X_0 is direct transfer; X_{b+1}(p) = mean over cosine-distributed rays from p of albedo(q) X_b(q), q
+being what the ray meets, zero where it meets nothing. The recursion is solved on patches, whose rays
+are traced once and kept as the patches they meet; points to be baked then gather the sum of all
+bounces with rays of their own, a chunk at a time.
+"""
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import sampling
+from . import spherical_harmonics as sh
+from .estimator import default_threads
+from .geometry import INSET, TriangleMesh, unit
+from .patches import Patches
+from .raycast import Geometry, Occluders
+
+PATCHES = 16384       # about as many; more sharpen the light that bounces near edges and shadows
+PATCH_RAYS = 256
+MAX_BOUNCES = 64
+INVISIBLE = 2e-3      # of all transfer: a bounce that adds less is the last
+_RAYS_AT_ONCE = 1 << 17
+_SETS = 16
+
+
+class Bounces:
+    """The light that leaves each patch after its bounces, for points to gather."""
+
+    def __init__(self, parts: Sequence[Geometry], albedo: NDArray, scene: Occluders, order: int, seed: int = 0,
+                 threads: int | None = None, budget: int = PATCHES) -> None:
+        """Prepare; nothing is traced yet.
+
+        Args:
+            parts: positions (V, 3), triangles (F, 3) of everything, in the order that `scene` has them.
+            albedo: (F, 3) of the triangles of all parts, 0 to 1.
+        """
+        self.patches = Patches(parts, budget)
+        self.albedo = np.clip(self.patches.mean(np.asarray(albedo, np.float64)), 0, 1)  # (M, 3)
+        self.added: list[float] = []  # transfer of constant light that each bounce added, of all of it
+        self._scene, self._order, self._seed = scene, order, seed
+        self._threads = threads or default_threads()
+        self._met = np.zeros((0, PATCH_RAYS), np.int32)   # (sides, rays) which traced side, -1: none
+        self._row = np.full(2 * self.patches.count, -1)   # row of each side that was traced
+        self._direct = np.zeros((0, order * order))
+        self._leaving = np.zeros((0, 3 * order * order), np.float32)  # albedo times the sum of bounces
+
+    @property
+    def used(self) -> int:
+        """How many bounces were computed."""
+        return len(self.added)
+
+    def solve(self, bounces: int = MAX_BOUNCES, tolerance: float = INVISIBLE) -> Generator[float, None, None]:
+        """Trace the patches once, and bounce until `bounces` are done, or one adds less than `tolerance`.
+
+        Yields:
+            Progress, 0 to 1.
+        """
+        if bounces == 0 or not self.albedo.any():
+            return
+        yield from self._trace()
+        reflectance = np.repeat(self.albedo, 2, axis=0)[np.flatnonzero(self._row >= 0)[np.argsort(
+            self._row[self._row >= 0])]]                                  # (sides, 3)
+        now = np.repeat(self._direct[:, :, None], 3, axis=2)              # (sides, K, 3)
+        total = np.zeros_like(now)
+        areas = self._areas()
+        whole = float(areas @ now[:, 0].mean(1))
+        for number in range(bounces):
+            leaving = (now * reflectance[:, None]).reshape(len(now), -1).astype(np.float32)
+            total += leaving.reshape(total.shape)
+            now = self.gathered(leaving).reshape(now.shape)
+            added = float(areas @ now[:, 0].mean(1))
+            whole += added
+            self.added.append(added / whole if whole > 0 else 0.0)
+            yield 0.5 + 0.5 * (number + 1) / bounces
+            if self.added[-1] < tolerance:
+                break
+        self._leaving = total.reshape(len(total), -1).astype(np.float32)
+
+    def gathered(self, leaving: NDArray[np.float32]) -> NDArray[np.float64]:
+        """(sides, C) that the rays of each traced side bring, of what leaves them (sides, C)."""
+        out = np.empty(leaving.shape)
+        padded = np.concatenate([leaving, np.zeros((1, leaving.shape[1]), np.float32)])  # what -1 brings
+        step = max(1, _RAYS_AT_ONCE // PATCH_RAYS)
+
+        def part(start: int) -> None:
+            met = self._met[start:start + step]
+            out[start:start + step] = padded[met.ravel()].reshape(*met.shape, -1).mean(1, dtype=np.float64)
+
+        with ThreadPoolExecutor(self._threads) as pool:
+            list(pool.map(part, range(0, len(self._met), step)))
+        return out
+
+    def gather(self, mesh: TriangleMesh, rays: int) -> Generator[float, None, NDArray[np.float32]]:
+        """What bounces bring to the points of a mesh: (N, K, 3), to be added to their direct transfer.
+
+        Yields:
+            Progress, 0 to 1. Closing the generator stops the workers.
+        """
+        terms = self._order ** 2
+        out = np.zeros((len(mesh.points), terms, 3), np.float32)
+        if not self.used or not self._leaving.any():
+            return out
+        rng = np.random.default_rng([self._seed, 3])
+        sets = sampling.hemisphere_sets(_SETS, rays, int(rng.integers(2**31)))
+        which, angles = rng.integers(0, _SETS, len(mesh.points)), rng.uniform(0, 2 * np.pi, len(mesh.points))
+        padded = np.concatenate([self._leaving, np.zeros((1, 3 * terms), np.float32)])
+        lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+        step = max(1, _RAYS_AT_ONCE // rays)
+
+        def part(points: NDArray) -> None:
+            frames = sampling.frames(mesh.normals[points], angles[points])
+            directions = np.einsum("nij,nrj->nri", frames, sets[which[points]]).astype(np.float32).reshape(-1, 3)
+            origins = self._scene.origins(mesh.points[points], mesh.clearance[points]).repeat(rays, axis=0)
+            met = self._met_by(origins, directions).reshape(-1, rays)
+            out[points] = padded[met.ravel()].reshape(len(points), rays, -1).mean(1).reshape(-1, terms, 3)
+
+        yield from _spread(part, [lit[s:s + step] for s in range(0, len(lit), step)], self._threads)
+        return out
+
+    def _trace(self) -> Generator[float, None, None]:
+        """Trace all fronts, and then the backs that were met, until no new ones are."""
+        fresh = 2 * np.arange(self.patches.count)
+        while len(fresh):
+            self._row[fresh] = len(self._direct) + np.arange(len(fresh))
+            sides = np.full((len(fresh), PATCH_RAYS), -1, np.int64)
+            direct = np.zeros((len(fresh), self._order ** 2))
+            step = max(1, _RAYS_AT_ONCE // PATCH_RAYS)
+            parts = [np.arange(s, min(s + step, len(fresh))) for s in range(0, len(fresh), step)]
+            seeds = np.random.SeedSequence([self._seed, 2, len(self._direct)]).spawn(len(parts))
+
+            def part(job: tuple[NDArray, np.random.SeedSequence], fresh: NDArray = fresh, sides: NDArray = sides,
+                     direct: NDArray = direct) -> None:
+                rows, seed = job
+                sides[rows], direct[rows] = self._traced(fresh[rows], np.random.default_rng(seed))
+
+            for share in _spread(part, list(zip(parts, seeds, strict=True)), self._threads):
+                yield 0.5 * share
+            self._met = np.concatenate([self._met, sides.astype(np.int32)])
+            self._direct = np.concatenate([self._direct, direct])
+            found = np.unique(sides[sides >= 0])
+            fresh = found[self._row[found] < 0]
+        self._met = np.where(self._met >= 0, self._row[self._met], -1).astype(np.int32)
+
+    def _traced(self, sides: NDArray, rng: np.random.Generator) -> tuple[NDArray, NDArray]:
+        """Sides that the rays of some sides (n,) meet (n, rays), and their direct transfer (n, K)."""
+        points, normals, inwards = self.patches.sample(sides, PATCH_RAYS, rng)
+        local = sampling.hemisphere_sets(1, PATCH_RAYS, int(rng.integers(2**31)))[0]
+        flat = normals.reshape(-1, 3)
+        # one turn for each patch keeps its rays a net; which point has which ray is chance
+        turns = np.repeat(rng.uniform(0, 2 * np.pi, len(sides)), PATCH_RAYS)
+        chosen = rng.permuted(np.tile(np.arange(PATCH_RAYS), (len(sides), 1)), axis=1).ravel()
+        directions = np.einsum("nij,nj->ni", sampling.frames(flat, turns), local[chosen])
+        clearance = flat + INSET * unit(inwards.reshape(-1, 3))
+        origins = self._scene.origins(points.reshape(-1, 3), clearance)
+        rays = np.ascontiguousarray(directions, dtype=np.float32)
+        hits = self._scene.hits(origins, rays)
+        met = np.full(len(rays), -1, np.int64)
+        met[hits.rays] = self.patches.of_hits(hits)
+        seen = sh.evaluate(directions, self._order) * (met < 0)[:, None]
+        return met.reshape(len(sides), -1), seen.reshape(len(sides), PATCH_RAYS, -1).mean(1)
+
+    def _met_by(self, origins: NDArray, directions: NDArray) -> NDArray[np.int64]:
+        """(R,) row of the traced side that each ray meets, -1 where it meets none."""
+        hits = self._scene.hits(origins, directions)
+        met = np.full(len(directions), -1, np.int64)
+        met[hits.rays] = self._row[self.patches.of_hits(hits)]
+        return met
+
+    def _areas(self) -> NDArray[np.float64]:
+        """(sides,) area of each traced side."""
+        out = np.zeros(len(self._direct))
+        traced = np.flatnonzero(self._row >= 0)
+        out[self._row[traced]] = self.patches.patch_areas[traced // 2]
+        return out
+
+
+def _spread(work: Callable, jobs: list, threads: int) -> Generator[float, None, None]:
+    """Do the jobs on some threads, a few at a time, yielding the share that is done."""
+    stop = threading.Event()
+
+    def guarded(job: object) -> None:
+        if not stop.is_set():
+            work(job)
+
+    with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+        try:
+            futures = [pool.submit(guarded, job) for job in jobs]
+            for number, future in enumerate(futures):
+                future.result()
+                yield (number + 1) / len(jobs)
+        finally:
+            stop.set()
