@@ -73,7 +73,7 @@ def _parts(table: Table, label: str, threads: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         times["write"] = seconds(lambda: [exr.write(
             Path(folder) / f"{i}.exr", result.image(i, filled).reshape(SIDE, SIDE, 4), "")
-            for i in range(texture.image_count(ORDER))])
+            for i in range(texture.image_count(ORDER ** 2))])
     sample = np.sort(np.random.default_rng(0).choice(len(points.points), _SAMPLE, replace=False))
     few = TriangleMesh(points.positions, points.triangles, points.points[sample], points.normals[sample],
                        points.clearance[sample], points.elements, points.domain, points.resolution)
@@ -123,7 +123,7 @@ def child() -> None:
     with tempfile.TemporaryDirectory() as folder:
         result = methods.run(texture.bake(surface, order=ORDER, side=4096, rays=16, folder=Path(folder) / "tiles"))
         filled = result.fill_map()
-        for i in range(texture.image_count(ORDER)):
+        for i in range(texture.image_count(ORDER ** 2)):
             exr.write(Path(folder) / f"{i}.exr", result.image(i, filled).reshape(4096, 4096, 4), "")
     print(json.dumps({"texels": result.record.points, "seconds": time.perf_counter() - began,
                       "peak": _megabytes("VmHWM") - start}))

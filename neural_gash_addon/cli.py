@@ -56,6 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     quality.add_argument("--tolerance", type=float, help="relative L2 error to reach (0.02)")
     bake.add_argument("--occluders", default="self", metavar="self|visible|COLLECTION",
                       help="what casts shadows on the object (self)")
+    bake.add_argument("--bounces", type=int, default=0, help="how often light may bounce between surfaces, at most (0)")
     bake.add_argument("--texture", type=int, metavar="SIDE", help="bake to a texture of SIDE x SIDE texels instead")
     bake.add_argument("--uv-map", metavar="NAME", default="", help="of the mesh, for --texture; else one is made")
     bake.add_argument("--textures", metavar="FOLDER", type=Path, help="write the textures as .exr there, not into OUT")
@@ -129,6 +130,7 @@ def _bake(arguments: argparse.Namespace) -> tuple[dict, str]:
         settings.collection = bpy.data.collections.get(arguments.occluders)
         if settings.collection is None:
             raise UserError(f"There is no collection named '{arguments.occluders}' in the file.")
+    _set(settings, "bounces", arguments.bounces)
     if arguments.texture is not None:
         settings.target = TEXTURE
         settings.sizing = RESOLUTION

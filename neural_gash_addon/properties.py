@@ -7,6 +7,7 @@ import math
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
+from .backend.bounce import MAX_BOUNCES
 from .backend.estimator import MAX_RAYS
 from .backend.methods import METHODS, MIN_ORDER, MIN_TOLERANCE
 from .backend.spherical_harmonics import MAX_ORDER
@@ -51,6 +52,10 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
                (COLLECTION, "Collection", "The objects of a collection cast shadows")])
     collection: PointerProperty(  # type: ignore[valid-type]
         name="Collection", description="Whose objects cast shadows", type=bpy.types.Collection)
+    bounces: IntProperty(  # type: ignore[valid-type]
+        name="Bounces", default=0, min=0, max=MAX_BOUNCES, soft_max=8,
+        description="How often light may bounce from surface to surface, in their colours, at most: it stops by itself "
+                    "where more would not be seen. 0: light comes from the sky alone")
     target: EnumProperty(  # type: ignore[valid-type]
         name="Target", description="Where the bake is kept", default=VERTICES,
         items=[(VERTICES, "Vertices", "Numbers at the vertices: quick, and enough for dense meshes"),

@@ -9,8 +9,10 @@ bounces with rays of their own, a chunk at a time.
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +23,46 @@ from .estimator import default_threads
 from .geometry import INSET, TriangleMesh, unit
 from .patches import Patches
 from .raycast import Geometry, Occluders
+from .transfer import Transfer
 
 PATCHES = 16384       # about as many; more sharpen the light that bounces near edges and shadows
 PATCH_RAYS = 256
+MIN_RAYS, MAX_RAYS = 64, 256  # of a point's gathering
 MAX_BOUNCES = 64
 INVISIBLE = 2e-3      # of all transfer: a bounce that adds less is the last
 _RAYS_AT_ONCE = 1 << 17
 _SETS = 16
+
+
+@dataclass(eq=False)
+class Reflection:
+    """What a bake with bounces wants, and the solution, once it has been made."""
+
+    albedo: NDArray[np.float64]  # (F, 3) of the triangles of what is baked, then of the occluders, in order
+    bounces: int                 # at most; fewer where more would not be seen
+    seed: int = 0                # one for all tiles of a texture
+    solution: Bounces | None = None
+
+    def add(self, transfer: Transfer, mesh: TriangleMesh, occluders: Sequence[Geometry], scene: Occluders,
+            threads: int | None) -> Generator[float, None, Transfer]:
+        """Direct transfer (N, K) of the points of a mesh with what bounces bring: (N, K, 3).
+
+        Solved once for all tiles of a texture. Where nothing bounces, the transfer as it is.
+        """
+        began = time.perf_counter()
+        order = transfer.record.order
+        if self.solution is None:
+            parts = [(mesh.positions, mesh.triangles), *occluders]
+            self.solution = Bounces(parts, self.albedo, scene, order, self.seed, threads)
+            yield from self.solution.solve(self.bounces)
+        if not self.solution.used:
+            return transfer
+        rays = int(np.clip(transfer.record.rays_per_point, MIN_RAYS, MAX_RAYS))
+        bounced = yield from self.solution.gather(mesh, rays)
+        record = replace(transfer.record, bounces=self.solution.used, colours=3,
+                         rays=transfer.record.rays + rays * len(mesh.points),
+                         seconds=transfer.record.seconds + time.perf_counter() - began)
+        return Transfer(transfer.coefficients[:, :, None] + bounced, record)
 
 
 class Bounces:

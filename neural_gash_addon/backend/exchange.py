@@ -92,6 +92,7 @@ def load_npz(path: Path) -> tuple[dict[str, NDArray], BakeRecord]:
         raise UserError(f"'{path}' is missing or no bake that Neural GASh saved.") from error
     found = BakeRecord.from_json(record)
     transfer = arrays["transfer"]
-    if transfer.dtype.kind != "f" or transfer.shape != (len(arrays["positions"]), found.order ** 2):
+    shape = (len(arrays["positions"]), found.order ** 2, 3)[:2 if found.colours == 1 else 3]
+    if transfer.dtype.kind != "f" or transfer.shape != shape:
         raise UserError(f"'{path}' does not hold the coefficients that its record tells of.")
     return arrays, found

@@ -11,6 +11,7 @@ import numpy as np
 
 from . import embree_bake
 from . import spherical_harmonics as sh
+from .bounce import Reflection
 from .errors import UserError
 from .estimator import MAX_RAYS
 from .geometry import TriangleMesh
@@ -59,7 +60,7 @@ METHODS: dict[str, Method] = {m.name: m for m in (
 
 def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: int | None = None,
          tolerance: float | None = None, occluders: Sequence[Geometry] = (), seed: int = 0,
-         threads: int | None = None, scene: Occluders | None = None) -> Baking:
+         threads: int | None = None, scene: Occluders | None = None, reflection: Reflection | None = None) -> Baking:
     """Bake the transfer of a mesh's points.
 
     Args:
@@ -70,6 +71,7 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
             point). A method that traces wants exactly one of the two.
         occluders: what else blocks, parts (positions (V, 3), triangles (F, 3)) in the same frame.
         scene: mesh and occluders in Embree, where they are there already from another bake.
+        reflection: light that bounces, if any shall; for methods that trace.
         seed: independent seeds give independent errors. threads: one a core where not given.
     Yields:
         Progress, 0 to 1, many times a second. `close()` stops the workers.
@@ -90,8 +92,34 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
             raise UserError(f"The number of rays must be 1 to {16 * MAX_RAYS}, not {rays}.")
         if tolerance is not None and not MIN_TOLERANCE * (1 - 1e-6) <= tolerance <= 1:  # Blender keeps float32
             raise UserError(f"The tolerance must be {MIN_TOLERANCE:g} to 1, not {tolerance:g}.")
-    return entry.bake(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed, threads=threads,
-                      scene=scene)
+    if reflection is None or not entry.traces:
+        return entry.bake(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed,
+                          threads=threads, scene=scene)
+    if scene is None:
+        scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
+    direct = entry.bake(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed, threads=threads,
+                        scene=scene)
+    return _with_bounces(direct, mesh, occluders, scene, threads, reflection)
+
+
+def _with_bounces(direct: Baking, mesh: TriangleMesh, occluders: Sequence[Geometry], scene: Occluders,
+                  threads: int | None, reflection: Reflection) -> Baking:
+    """A bake of direct transfer, and then what bounces add to it."""
+    try:
+        while True:
+            yield 0.6 * next(direct)
+    except StopIteration as end:
+        transfer: Transfer = end.value
+    finally:
+        direct.close()
+    adding = reflection.add(transfer, mesh, occluders, scene, threads)
+    try:
+        while True:
+            yield 0.6 + 0.4 * next(adding)
+    except StopIteration as end:
+        return end.value
+    finally:
+        adding.close()
 
 
 def run(baking: Generator[float, None, Result], progress: Callable[[float], None] | None = None) -> Result:

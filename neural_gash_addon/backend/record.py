@@ -42,10 +42,16 @@ class BakeRecord:
     target: str = "vertices"          # or 'texture'
     side: int = 0                     # texels a side of a texture
     uv_map: str = ""                  # whose coordinates the texture has
-    bounces: int = 0
+    bounces: int = 0                  # of diffuse interreflection that were computed
+    colours: int = 1                  # transfer is (N, K), or (N, K, 3) where light bounced off colours
     basis: str = BASIS
     version: str = VERSION
     schema: int = SCHEMA
+
+    @property
+    def terms(self) -> int:
+        """How many numbers each point has."""
+        return self.order ** 2 * self.colours
 
     @property
     def rays_per_point(self) -> float:
@@ -77,7 +83,8 @@ class BakeRecord:
         except (TypeError, ValueError) as error:
             raise UserError(_DAMAGED) from error
         if (frame.shape != (9,) or not np.allclose(frame.reshape(3, 3) @ frame.reshape(3, 3).T, np.eye(3), atol=1e-3)
-                or not 1 <= record.order <= MAX_ORDER or record.domain not in (POINT, CORNER, TEXEL)):
+                or not 1 <= record.order <= MAX_ORDER or record.domain not in (POINT, CORNER, TEXEL)
+                or record.colours not in (1, 3)):
             raise UserError(_DAMAGED)
         object.__setattr__(record, "frame", tuple(frame.tolist()))
         return record

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import methods
+from .bounce import Reflection
 from .errors import UserError
 from .exchange import atomic, reason
 from .geometry import Surface
@@ -35,7 +36,7 @@ class TextureTransfer:
 
     uv: NDArray[np.float64]                  # (C, 2) of each face corner
     texels: list[NDArray[np.int64]]          # of each tile, (n,) row * side + column
-    coefficients: list[NDArray[np.float32]]  # of each tile, (n, K)
+    coefficients: list[NDArray[np.float32]]  # of each tile, (n, K); coloured ones (n, 3K), red, green, blue of each
     record: BakeRecord
 
     def fill_map(self) -> NDArray[np.int64]:
@@ -47,7 +48,7 @@ class TextureTransfer:
         return fill_map(covered.reshape(side, side))
 
     def image(self, index: int, filled: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Coefficients 4 * index .. 4 * index + 3 as an image (side * side, 4), row 0 at the bottom."""
+        """Numbers 4 * index .. 4 * index + 3 of the texels as an image (side * side, 4), row 0 at the bottom."""
         out = np.zeros((self.record.side ** 2, CHANNELS), np.float32)
         for texels, coefficients in zip(self.texels, self.coefficients, strict=True):
             part = coefficients[:, CHANNELS * index:CHANNELS * (index + 1)]
@@ -55,16 +56,16 @@ class TextureTransfer:
         return out[filled]
 
 
-def image_count(order: int) -> int:
-    """How many images the order**2 coefficients take."""
-    return -(-order * order // CHANNELS)
+def image_count(terms: int) -> int:
+    """How many images the numbers of a texel take."""
+    return -(-terms // CHANNELS)
 
 
 def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArray | None = None,
          side: int | None = None, texels_per_metre: float | None = None, padding: int = 2, rays: int | None = None,
          tolerance: float | None = None, occluders: Sequence[Geometry] = (), normal_maps: Sequence[NormalMap] = (),
          seed: int = 0, threads: int | None = None, folder: Path | None = None, key: str = "",
-         ) -> Generator[float, None, TextureTransfer]:
+         reflection: Reflection | None = None) -> Generator[float, None, TextureTransfer]:
     """Bake the transfer of a texture's texels.
 
     Args:
@@ -75,6 +76,7 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
             met by every tile.
         folder: where finished tiles are kept, so that a bake that was killed goes on from there and
             gives the same numbers. key: what tells this bake from others in the same folder.
+        reflection: light that bounces, if any shall.
     Yields:
         Progress, 0 to 1.
     Raises:
@@ -109,12 +111,12 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
             if scene is None and methods.METHODS[method].traces:
                 scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
             baking = methods.bake(mesh, method, order, rays=rays, tolerance=tolerance, seed=_tile_seed(seed, number),
-                                  threads=threads, scene=scene)
+                                  occluders=occluders, threads=threads, scene=scene, reflection=reflection)
             try:
                 while True:
                     yield done + share * next(baking)
             except StopIteration as end:
-                found = end.value.coefficients, end.value.record
+                found = end.value.coefficients.reshape(len(mesh.points), -1), end.value.record
             finally:
                 baking.close()
             if store:
@@ -194,7 +196,7 @@ class _Store:
             coefficients = np.load(self._folder / f"{number:04d}.npy", mmap_mode="r")
         except (OSError, ValueError, UserError):
             return None
-        return (coefficients, record) if coefficients.shape == (points, record.order ** 2) else None
+        return (coefficients, record) if coefficients.shape == (points, record.terms) else None
 
     def save(self, number: int, coefficients: NDArray[np.float32], record: BakeRecord
              ) -> tuple[NDArray[np.float32], BakeRecord]:

@@ -14,5 +14,5 @@ from .record import BakeRecord
 class Transfer:
     """Diffuse transfer T[k] = 1/pi int V(w) max(n.w, 0) Y_k(w) dw for N points."""
 
-    coefficients: NDArray[np.float32]  # (N, K)
+    coefficients: NDArray[np.float32]  # (N, K), or (N, K, 3) where light bounces off colours
     record: BakeRecord

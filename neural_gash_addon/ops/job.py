@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend import methods
+from ..backend.bounce import Reflection
 from ..backend.errors import UserError
 from ..backend.record import VERSION, BakeRecord
 from ..backend.texels import NormalMap
@@ -20,11 +21,21 @@ from ..backend.texture import TextureTransfer, remove_tiles
 from ..backend.texture import bake as bake_texture
 from ..backend.transfer import Transfer
 from ..properties import COLLECTION, DENSITY, RAYS, TEXTURE, NeuralGashSettings
-from ..scene.attributes import read_record, write_textures, write_transfer
+from ..scene.attributes import attribute_count, read_record, write_textures, write_transfer
 from ..scene.lighting import apply_light, take_light
 from ..scene.normal_maps import read_normal_maps
-from ..scene.preview import preview_off, preview_on
-from ..scene.read import SELF, VISIBLE, SceneMesh, fingerprint, read_object, read_occluders, refusal, same_fingerprint
+from ..scene.preview import EEVEE_ATTRIBUTES, preview_off, preview_on
+from ..scene.read import (
+    SELF,
+    VISIBLE,
+    SceneMesh,
+    fingerprint,
+    read_albedo,
+    read_object,
+    read_occluders,
+    refusal,
+    same_fingerprint,
+)
 from ..scene.uv_maps import check_room, read_uv
 
 
@@ -51,6 +62,7 @@ class Job:
     fingerprint: str
     frame: tuple[float, ...]
     texture: TextureOptions | None  # None: to vertices
+    bounces: bool          # light was to bounce, so the albedo counts
 
 
 def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: NeuralGashSettings,
@@ -77,6 +89,12 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
     by_rays = settings.quality == RAYS
     rays = settings.rays if method.traces and by_rays else None
     tolerance = settings.tolerance if method.traces and not by_rays else None
+    reflection = None
+    if method.traces and settings.bounces:
+        if settings.target != TEXTURE and attribute_count(3 * settings.order ** 2) > EEVEE_ATTRIBUTES:
+            raise UserError(f"With bounces, an order-{settings.order} bake takes more than the {EEVEE_ATTRIBUTES} "
+                            "attributes that EEVEE draws; choose order 4 or less, or bake to a texture.")
+        reflection = Reflection(read_albedo(obj, mode, depsgraph), settings.bounces)
     texture = None
     uv = None
     baking: Generator[float, None, Transfer | TextureTransfer]
@@ -92,17 +110,18 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
         texture = TextureOptions(uv is None, settings.uv_map, folder, settings.half, tiles)
         dense = settings.sizing == DENSITY and uv is None
         maps = read_normal_maps(obj, depsgraph, read.surface, read.matrix)
-        before = fingerprint(obj, depsgraph, mode, uv)
+        before = fingerprint(obj, depsgraph, mode, uv, reflection is not None)
         baking = bake_texture(
             read.surface, settings.method, settings.order, uv=uv, side=None if dense else settings.side,
             texels_per_metre=settings.texels_per_metre if dense else None, padding=settings.padding, rays=rays,
             tolerance=tolerance, occluders=occluders, normal_maps=maps, folder=tiles,
-            key=_key(settings, before, read.matrix, maps))
+            key=_key(settings, before, read.matrix, maps), reflection=reflection)
     else:
-        before = fingerprint(obj, depsgraph, mode)
+        before = fingerprint(obj, depsgraph, mode, bounces=reflection is not None)
         baking = methods.bake(read.mesh, settings.method, settings.order, rays=rays, tolerance=tolerance,
-                              occluders=occluders)
-    return Job(obj.session_uid, obj.name, read, baking, mode, before, read.frame, texture)
+                              occluders=occluders, reflection=reflection)
+    return Job(obj.session_uid, obj.name, read, baking, mode, before, read.frame, texture,
+               reflection is not None)
 
 
 def _key(settings: NeuralGashSettings, shape: str, matrix: NDArray, maps: Sequence[NormalMap]) -> str:
@@ -111,7 +130,8 @@ def _key(settings: NeuralGashSettings, shape: str, matrix: NDArray, maps: Sequen
     for normal_map in maps:
         digest.update(normal_map.image.tobytes() + normal_map.uv.tobytes() + str(normal_map.strength).encode())
     chosen = {name: getattr(settings, name) for name in
-              ("method", "order", "quality", "rays", "tolerance", "sizing", "side", "texels_per_metre", "padding")}
+              ("method", "order", "quality", "rays", "tolerance", "sizing", "side", "texels_per_metre", "padding",
+               "bounces")}
     return json.dumps({"version": VERSION, "shape": shape, "place": digest.hexdigest(), **chosen}, sort_keys=True)
 
 
@@ -129,15 +149,18 @@ def finish(context: bpy.types.Context, job: Job, transfer: Transfer | TextureTra
         raise UserError(f"'{job.name}' was deleted while it was being baked.")
     depsgraph = context.evaluated_depsgraph_get()
     uv_map = job.texture.uv_map if job.texture else ""
-    now = fingerprint(obj, depsgraph, job.occluders, read_uv(obj.data, uv_map) if uv_map else None)
+    now = fingerprint(obj, depsgraph, job.occluders, read_uv(obj.data, uv_map) if uv_map else None,
+                      job.bounces)
     if not same_fingerprint(now, job.fingerprint):
         raise UserError(f"'{obj.name}' or what shadows it was changed during the bake; bake again.")
+    if job.bounces and transfer.record.colours == 1:  # nothing bounced: no colour counts
+        now = fingerprint(obj, depsgraph, job.occluders, read_uv(obj.data, uv_map) if uv_map else None)
     record = replace(transfer.record, occluders=job.occluders, fingerprint=now, frame=job.frame, uv_map=uv_map)
     if isinstance(transfer, TextureTransfer):
         assert job.texture is not None
         if job.texture.own_uv:
-            record = replace(record, fingerprint=fingerprint(obj, depsgraph, job.occluders,
-                                                             transfer.uv.astype(np.float32)))
+            now = fingerprint(obj, depsgraph, job.occluders, transfer.uv.astype(np.float32), record.colours == 3)
+            record = replace(record, fingerprint=now)
         write_textures(obj, replace(transfer, record=record), own_uv=job.texture.own_uv, folder=job.texture.folder,
                        half=job.texture.half)
         if job.texture.tiles is not None:
@@ -170,6 +193,8 @@ def summary(record: BakeRecord) -> str:
     """One line for the report: points, time, rays, estimated error."""
     what = f"{record.side} x {record.side} texels" if record.side else f"{record.points:,} points"
     text = f"Baked {what} in {record.seconds:.2f} s"
+    if record.bounces:
+        text += f", {record.bounces} bounce{'s' if record.bounces > 1 else ''}"
     if record.rays:
         text += f", {record.rays_per_point:.0f} rays a point"
     if record.error_estimate is not None:

@@ -73,6 +73,8 @@ class NEURAL_GASH_PT_main(_Panel, bpy.types.Panel):
         column.label(text=f"{label}, order {record.order}, {record.points:,} points")
         if record.side:
             column.label(text=f"Texture: {record.side} x {record.side}, UV map {record.uv_map}")
+        if record.bounces:
+            column.label(text=f"Bounces: {record.bounces}")
         column.label(text=f"Time: {record.seconds:.2f} s")
         if record.rays:
             column.label(text=f"Rays: {record.rays_per_point:.0f} a point")
@@ -119,6 +121,7 @@ class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):
             layout.prop(settings, "occluders")
             if settings.occluders == COLLECTION:
                 layout.prop(settings, "collection")
+            layout.prop(settings, "bounces")
         layout.prop(settings, "target", expand=True)
         if settings.target == TEXTURE:
             self._texture(layout, settings, context.object)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Where a bake lives on a mesh: attributes `_prt_0`, `_prt_1`, … or images, and the record beside them.
 
-Attribute i holds coefficients 4i..4i+3 as red, green, blue, alpha of a FLOAT_COLOR: float32,
+Attribute i holds numbers 4i..4i+3 of a point as red, green, blue, alpha of a FLOAT_COLOR: float32,
 signed, exact, and four of them for one of the 14 attributes that EEVEE can draw. The leading
-underscore makes the glTF exporter carry them.
+underscore makes the glTF exporter carry them. A point's numbers are its coefficients; coloured
+ones are K times red, green and blue.
 """
 from __future__ import annotations
 
@@ -30,9 +31,9 @@ CHANNELS = 4
 _OURS = re.compile(rf"{PREFIX}\d+")  # chosen as 'the' colour by Blender, not by a person
 
 
-def attribute_count(order: int) -> int:
-    """How many attributes the order**2 coefficients take."""
-    return -(-order * order // CHANNELS)
+def attribute_count(terms: int) -> int:
+    """How many attributes the numbers of a point take."""
+    return -(-terms // CHANNELS)
 
 
 def has_bake(obj: bpy.types.Object | None) -> bool:
@@ -54,7 +55,7 @@ def write_transfer(obj: bpy.types.Object, mesh: TriangleMesh, transfer: Transfer
     _check_mode(obj)
     if len(mesh.elements) != len(data.vertices if mesh.domain == POINT else data.loops):
         raise UserError(f"'{obj.name}' was changed while it was being baked; bake again.")
-    count = attribute_count(transfer.record.order)
+    count = attribute_count(transfer.record.terms)
     own = _own_attributes(data)
     names = {f"{PREFIX}{i}" for i in range(count)} - set(own)
     taken = sorted(names & {*data.attributes.keys(), *obj.vertex_groups.keys()})  # groups share the name space
@@ -63,10 +64,11 @@ def write_transfer(obj: bpy.types.Object, mesh: TriangleMesh, transfer: Transfer
                         "rename or remove it to bake.")
     discard(data)
     chosen = _chosen_attributes(data)
-    terms = transfer.coefficients.shape[1]
+    terms = transfer.record.terms
+    flat = transfer.coefficients.reshape(len(transfer.coefficients), terms)
     values = np.zeros((len(mesh.elements), CHANNELS), np.float32)
     for index in range(count):
-        part = transfer.coefficients[:, CHANNELS * index:CHANNELS * (index + 1)]
+        part = flat[:, CHANNELS * index:CHANNELS * (index + 1)]
         width = min(CHANNELS, terms - CHANNELS * index)
         values[:, :width] = part[mesh.elements]
         values[:, width:] = 0
@@ -109,7 +111,7 @@ def _check_mode(obj: bpy.types.Object) -> None:
 
 
 def read_transfer(obj: bpy.types.Object) -> tuple[NDArray[np.float32], BakeRecord]:
-    """The bake on the object's mesh: (E, K) coefficients of each vertex or face corner, and the record.
+    """The bake on the object's mesh: (E, K) or (E, K, 3) of each vertex or face corner, and the record.
 
     Raises:
         UserError: there is no bake, or it is damaged.
@@ -121,11 +123,12 @@ def read_transfer(obj: bpy.types.Object) -> tuple[NDArray[np.float32], BakeRecor
     check_whole(data, record)
     elements = len(data.vertices if record.domain == POINT else data.loops)
     columns = []
-    for index in range(attribute_count(record.order)):
+    for index in range(attribute_count(record.terms)):
         values = np.empty((elements, CHANNELS), np.float32)
         data.attributes[f"{PREFIX}{index}"].data.foreach_get("color", values.ravel())
         columns.append(values)
-    return np.concatenate(columns, axis=1)[:, :record.order ** 2], record
+    found = np.concatenate(columns, axis=1)[:, :record.terms]
+    return found if record.colours == 1 else found.reshape(elements, -1, record.colours), record
 
 
 def check_whole(data: bpy.types.Mesh, record: BakeRecord) -> None:
@@ -134,7 +137,7 @@ def check_whole(data: bpy.types.Mesh, record: BakeRecord) -> None:
         bake_images(data, record)
         return
     elements = len(data.vertices if record.domain == POINT else data.loops)
-    for name in (f"{PREFIX}{i}" for i in range(attribute_count(record.order))):
+    for name in (f"{PREFIX}{i}" for i in range(attribute_count(record.terms))):
         attribute = data.attributes.get(name)
         whole = (attribute is not None and attribute.data_type == "FLOAT_COLOR"
                  and attribute.domain == record.domain and len(attribute.data) == elements)
@@ -174,9 +177,9 @@ def _own_attributes(data: bpy.types.Mesh) -> list[str]:
         return []
     try:
         record = BakeRecord.from_json(data[RECORD])
-        count = 0 if record.domain == TEXEL else attribute_count(record.order)
+        count = 0 if record.domain == TEXEL else attribute_count(record.terms)
     except UserError:
-        count = attribute_count(MAX_ORDER)
+        count = attribute_count(3 * MAX_ORDER ** 2)
     return [name for name in (f"{PREFIX}{i}" for i in range(count))
             if name in data.attributes and data.attributes[name].data_type == "FLOAT_COLOR"]
 

@@ -65,7 +65,7 @@ def bake_images(data: bpy.types.Mesh, record: BakeRecord) -> list[bpy.types.Imag
         UserError: one is missing, cannot be loaded, has another size, or belongs to another bake.
     """
     images = [image for image in _attached(data) if image is not None]
-    if len(images) != image_count(record.order):
+    if len(images) != image_count(record.terms):
         raise UserError(f"The bake of '{data.name}' has lost some of its images; bake again.")
     for image in images:
         if not image.packed_file:
@@ -93,7 +93,7 @@ def _attached(data: bpy.types.Mesh) -> list[bpy.types.Image | None]:
 def _write(name: str, transfer: TextureTransfer, folder: Path, half: bool) -> list[Path]:
     """Write the files, each in one step, and the record beside them."""
     clean = re.sub(r"[^\w.-]+", "_", name) or "mesh"
-    paths = [folder / f"{clean}_prt_{number}.exr" for number in range(image_count(transfer.record.order))]
+    paths = [folder / f"{clean}_prt_{number}.exr" for number in range(image_count(transfer.record.terms))]
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

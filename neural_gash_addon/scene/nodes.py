@@ -8,29 +8,33 @@ from collections.abc import Sequence
 import bpy
 from numpy.typing import NDArray
 
-from .attributes import CHANNELS, PREFIX, attribute_count
+from .attributes import PREFIX, attribute_count
 
-GROUP_VERSION = 1  # raise it when the group changes; materials in old files keep the group they have
-_VERSION, _ORDER = "neural_gash_version", "neural_gash_order"  # custom properties of the group
+GROUP_VERSION = 2  # raise it when the group changes; materials in old files keep the group they have
+# custom properties of the group
+_VERSION, _ORDER, _COLOURS = "neural_gash_version", "neural_gash_order", "neural_gash_colours"
 DEFAULT_ALBEDO = 0.8
 
 
-def ensure_group(order: int, images: Sequence[bpy.types.Image] = (), uv_map: str = "") -> bpy.types.NodeTree:
+def ensure_group(order: int, colours: int = 1, images: Sequence[bpy.types.Image] = (), uv_map: str = "",
+                 ) -> bpy.types.NodeTree:
     """The group `PRT Shading <order>`: made where it is missing or of another version only.
 
     Inputs Albedo and L0..L{K-1}, one RGB vector for each coefficient of the light; output Shader, an
     emission. Its light is at first a white sky of radiance 1, which shows ambient occlusion.
 
     Args:
+        colours: 3 where each coefficient has a red, a green and a blue.
         images, uv_map: where the coefficients of a texture bake are; such a group is of that bake alone.
     """
     place = [image.session_uid for image in images]
     for group in bpy.data.node_groups:
         if (group.get(_ORDER) == order and group.get(_VERSION) == GROUP_VERSION and group.library is None
-                and _place(group) == (place, uv_map)):
+                and group.get(_COLOURS) == colours and _place(group) == (place, uv_map)):
             return group
     group = bpy.data.node_groups.new(f"PRT Shading {order}", "ShaderNodeTree")
-    _build(group, order, _images(group, images, uv_map) if images else _attributes(group, order))
+    _build(group, order, colours,
+           _images(group, images, uv_map) if images else _attributes(group, order ** 2 * colours))
     return group
 
 
@@ -45,9 +49,9 @@ def is_group(group: bpy.types.NodeTree | None) -> bool:
     return group is not None and _ORDER in group
 
 
-def group_order(group: bpy.types.NodeTree) -> int:
-    """The order of one of `ensure_group`'s groups."""
-    return int(group[_ORDER])
+def group_terms(group: bpy.types.NodeTree) -> tuple[int, int]:
+    """Order and colours of one of `ensure_group`'s groups."""
+    return int(group[_ORDER]), int(group.get(_COLOURS, 1))
 
 
 def set_light(node: bpy.types.ShaderNodeGroup, light: NDArray) -> None:
@@ -66,10 +70,10 @@ def _add(group: bpy.types.NodeTree, kind: str, x: float, y: float) -> bpy.types.
     return node
 
 
-def _attributes(group: bpy.types.NodeTree, order: int) -> Sources:
+def _attributes(group: bpy.types.NodeTree, terms: int) -> Sources:
     """Nodes that read the attributes of a bake to vertices."""
     sources = []
-    for index in range(attribute_count(order)):
+    for index in range(attribute_count(terms)):
         attribute = _add(group, "ShaderNodeAttribute", -600, -200 * index)
         attribute.attribute_type = "GEOMETRY"
         attribute.attribute_name = f"{PREFIX}{index}"
@@ -90,8 +94,8 @@ def _images(group: bpy.types.NodeTree, images: Sequence[bpy.types.Image], uv_map
     return sources
 
 
-def _build(group: bpy.types.NodeTree, order: int, sources: Sources) -> None:
-    """Fill the group. K multiply-adds, each of a scalar coefficient and an RGB light vector."""
+def _build(group: bpy.types.NodeTree, order: int, colours: int, sources: Sources) -> None:
+    """Fill the group. K multiply-adds, each of a coefficient (a number, or RGB) and an RGB light vector."""
     terms = order * order
     albedo = group.interface.new_socket("Albedo", in_out="INPUT", socket_type="NodeSocketColor")
     albedo.default_value = (DEFAULT_ALBEDO,) * 3 + (1.0,)
@@ -101,19 +105,26 @@ def _build(group: bpy.types.NodeTree, order: int, sources: Sources) -> None:
         socket.description = "Light coefficient, RGB; k = l*(l+1)+m"
     group.interface.new_socket("Shader", in_out="OUTPUT", socket_type="NodeSocketShader")
     inputs = _add(group, "NodeGroupInput", -800, 300)
-    total = None
+    numbers: list[bpy.types.NodeSocket] = []
     for index, (colour, alpha) in enumerate(sources):
         split = _add(group, "ShaderNodeSeparateColor", -400, -200 * index)
         group.links.new(colour, split.inputs[0])
-        for channel, coefficient in enumerate([*split.outputs, alpha][:terms - CHANNELS * index]):
-            k = CHANNELS * index + channel
-            term = _add(group, "ShaderNodeVectorMath", -200, -200 * index - 45 * channel)
-            term.operation = "MULTIPLY" if total is None else "MULTIPLY_ADD"
-            group.links.new(coefficient, term.inputs[0])
-            group.links.new(inputs.outputs[f"L{k}"], term.inputs[1])
-            if total is not None:
-                group.links.new(total, term.inputs[2])
-            total = term.outputs[0]
+        numbers += [*split.outputs, alpha]
+    total = None
+    for k in range(terms):
+        coefficient = numbers[k]
+        if colours == 3:
+            joined = _add(group, "ShaderNodeCombineXYZ", -300, -50 * k)
+            for channel in range(3):
+                group.links.new(numbers[3 * k + channel], joined.inputs[channel])
+            coefficient = joined.outputs[0]
+        term = _add(group, "ShaderNodeVectorMath", -200, -50 * k)
+        term.operation = "MULTIPLY" if total is None else "MULTIPLY_ADD"
+        group.links.new(coefficient, term.inputs[0])
+        group.links.new(inputs.outputs[f"L{k}"], term.inputs[1])
+        if total is not None:
+            group.links.new(total, term.inputs[2])
+        total = term.outputs[0]
     coloured = _add(group, "ShaderNodeVectorMath", 0, 0)
     coloured.operation = "MULTIPLY"
     group.links.new(inputs.outputs["Albedo"], coloured.inputs[0])
@@ -122,4 +133,4 @@ def _build(group: bpy.types.NodeTree, order: int, sources: Sources) -> None:
     group.links.new(coloured.outputs[0], emission.inputs["Color"])
     outputs = _add(group, "NodeGroupOutput", 400, 0)
     group.links.new(emission.outputs[0], outputs.inputs["Shader"])
-    group[_ORDER], group[_VERSION] = order, GROUP_VERSION
+    group[_ORDER], group[_VERSION], group[_COLOURS] = order, GROUP_VERSION, colours

@@ -17,11 +17,11 @@ from ..backend.geometry import TEXEL
 from .attributes import attribute_count, check_whole, has_bake, read_record
 from .frames import as_array, bake_frame
 from .images import bake_images, remove_unused
-from .nodes import DEFAULT_ALBEDO, ensure_group, group_order, is_group, set_light
+from .nodes import DEFAULT_ALBEDO, ensure_group, group_terms, is_group, set_light
 
 _STATE = "neural_gash_preview"  # custom property of a preview material: what its slot held
 EEVEE_ATTRIBUTES = 14           # with 15, EEVEE draws magenta, whatever their types
-_COLOUR_SOCKETS = {"BSDF_PRINCIPLED": "Base Color", "BSDF_DIFFUSE": "Color"}
+COLOUR_SOCKETS = {"BSDF_PRINCIPLED": "Base Color", "BSDF_DIFFUSE": "Color"}
 _TEXTURES_ON_UV = {"TEX_IMAGE"}
 
 
@@ -44,13 +44,13 @@ def preview_on(obj: bpy.types.Object) -> None:
     if images and record.uv_map not in obj.data.uv_layers:
         raise UserError(f"The UV map '{record.uv_map}' of the bake of '{obj.name}' is gone; bake again.")
     preview_off(obj)
-    group = ensure_group(record.order, images, record.uv_map if images else "")
+    group = ensure_group(record.order, record.colours, images, record.uv_map if images else "")
     originals = [slot.material for slot in obj.material_slots] or [None]
     previews: list[bpy.types.Material] = []
     try:
         for original in originals:
             previews.append(_preview_material(original, group))
-            _check_attributes(original, previews[-1], record.order, 1 if images else attribute_count(record.order))
+            _check_attributes(original, previews[-1], record.order, 1 if images else attribute_count(record.terms))
     except UserError:
         _remove_unused(previews)
         raise
@@ -110,7 +110,7 @@ def update_light(obj: bpy.types.Object, light: NDArray) -> None:
         raise ValueError(f"the light has {len(light)} coefficients, the bake {terms}")
     turn = np.array(record.frame).reshape(3, 3) @ bake_frame(obj).T
     seen = sh.rotate(np.asarray(light)[:terms], turn)
-    if any(group_order(node.node_tree) != record.order for node in _group_nodes(obj)):
+    if any(group_terms(node.node_tree) != (record.order, record.colours) for node in _group_nodes(obj)):
         preview_on(obj)  # baked again at another order
     for slot in obj.material_slots:
         if _state(slot.material) is not None and slot.material.users > 1:
@@ -168,6 +168,12 @@ def _preview_material(original: bpy.types.Material | None, group: bpy.types.Node
     return preview
 
 
+def shown_material(material: bpy.types.Material | None) -> bpy.types.Material | None:
+    """The person's material: of a preview's, the one that it stands for."""
+    state = _state(material)
+    return material if state is None else state.get("shown")
+
+
 def shader_node(material: bpy.types.Material | None) -> bpy.types.Node | None:
     """The first Principled or Diffuse shader that reaches the output of a material."""
     if material is None or not _has_nodes(material) or material.node_tree is None:
@@ -176,13 +182,13 @@ def shader_node(material: bpy.types.Material | None) -> bpy.types.Node | None:
     output = next((o for o in map(tree.get_output_node, ("ALL", "EEVEE", "CYCLES")) if o is not None), None)
     if output is None:
         return None
-    return next((node for node in _upstream(output.inputs["Surface"]) if node.type in _COLOUR_SOCKETS), None)
+    return next((node for node in _upstream(output.inputs["Surface"]) if node.type in COLOUR_SOCKETS), None)
 
 
 def _colour_socket(material: bpy.types.Material) -> bpy.types.NodeSocket | None:
     """The colour input of a material's shader."""
     node = shader_node(material)
-    return None if node is None else node.inputs[_COLOUR_SOCKETS[node.type]]
+    return None if node is None else node.inputs[COLOUR_SOCKETS[node.type]]
 
 
 def _upstream(*sockets: bpy.types.NodeSocket) -> list[bpy.types.Node]:

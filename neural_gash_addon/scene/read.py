@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..backend.errors import UserError
 from ..backend.geometry import Surface, TriangleMesh, unit
+from .albedo import triangle_albedo
 from .attributes import RECORD, discard
 from .evaluation import evaluated, revealed, shown_objects
 from .frames import Array, as_array, bake_frame, rotation_part
@@ -147,16 +148,28 @@ def read_occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgr
         UserError: there is no such collection.
     """
     return [(_transform(local, matrix), _outward(triangles, matrix))
-            for local, triangles, matrix in _occluders(obj, mode, depsgraph)]
+            for local, triangles, _, matrix in _occluders(obj, mode, depsgraph)]
+
+
+def read_albedo(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph) -> Array:
+    """(F, 3) albedo of the triangles of `obj`, then of those that `read_occluders` gives, in its order."""
+    with evaluated(obj, depsgraph) as copy:
+        mesh = copy.to_mesh()
+        try:
+            own = triangle_albedo(obj, mesh, _triangle_corners(mesh))
+        finally:
+            copy.to_mesh_clear()
+    return np.concatenate([own, *(albedo for _, _, albedo, _ in _occluders(obj, mode, depsgraph, coloured=True))])
 
 
 def fingerprint(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, occluder_mode: str = SELF,
-                uv: NDArray[np.float32] | None = None) -> str:
+                uv: NDArray[np.float32] | None = None, bounces: bool = False) -> str:
     """What a bake of `obj` depends on, in a short text; compare two with `same_fingerprint`.
 
     Without other occluders it is the same wherever the object stands, however it is turned and
     uniformly scaled (none of which changes transfer). With them, what counts is where they stand
-    from the object. A texture's UVs (C, 2) count too.
+    from the object. A texture's UVs (C, 2) count too,
+    and with bounces the albedo of everything.
 
     Raises:
         UserError: as `read_object`.
@@ -196,11 +209,13 @@ def fingerprint(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, occluder_
         seen = np.linalg.inv(rigid)
         shapes: dict[int, tuple[NDArray, bytes]] = {}  # instances share arrays; held, so that ids stay theirs
         entries = []
-        for local, triangles, place in _occluders(obj, occluder_mode, depsgraph):
+        for local, triangles, _, place in _occluders(obj, occluder_mode, depsgraph):
             if id(local) not in shapes:
                 shapes[id(local)] = local, hashlib.blake2b(local.tobytes() + triangles.tobytes()).digest()
             entries.append(shapes[id(local)][1] + _place(seen @ place, grain))
         digest.update(b"".join(sorted(entries)))
+    if bounces:
+        digest.update(np.round(read_albedo(obj, occluder_mode, depsgraph), 4).tobytes())
     return digest.hexdigest() + ":" + ",".join(text)
 
 
@@ -216,13 +231,16 @@ def same_fingerprint(first: str, second: str) -> bool:
     return a.shape == b.shape and bool(np.allclose(a, b, rtol=2 * _SAME, atol=2 * _SAME))
 
 
-def _occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph,
-               ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int32], Array]]:
-    """(local positions, triangles, world matrix) of each object and instance that blocks, but `obj`."""
+def _occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph, coloured: bool = False,
+               ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int32], Array, Array]]:
+    """(local positions, triangles, albedo, world matrix) of each object and instance that blocks, but `obj`.
+
+    The albedo (F, 3) is empty unless `coloured`: images take time to read.
+    """
     if mode == SELF:
         return
     if mode == VISIBLE:
-        yield from _instances(depsgraph, None, obj)
+        yield from _instances(depsgraph, None, obj, coloured)
         return
     collection = bpy.data.collections.get(mode)
     if collection is None:
@@ -230,19 +248,19 @@ def _occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph,
     members = [o for o in collection.all_objects if o != obj]
     hidden = [o for o in members if not o.visible_get(view_layer=depsgraph.view_layer)]
     owners = {o.session_uid for o in collection.all_objects} - {o.session_uid for o in hidden}
-    yield from _instances(depsgraph, owners, obj)
+    yield from _instances(depsgraph, owners, obj, coloured)
     if hidden:
         with revealed(hidden, depsgraph) as (own_depsgraph, _):
-            yield from _instances(own_depsgraph, None, None)
+            yield from _instances(own_depsgraph, None, None, coloured)
 
 
-def _instances(depsgraph: bpy.types.Depsgraph, owners: set[int] | None, baked: bpy.types.Object | None,
-               ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int32], Array]]:
+def _instances(depsgraph: bpy.types.Depsgraph, owners: set[int] | None, baked: bpy.types.Object | None, coloured: bool,
+               ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int32], Array, Array]]:
     """The solid objects and instances of a depsgraph; of the objects in `owners` only, where given.
 
     `baked` itself is left out, but instances of it elsewhere are not.
     """
-    known: dict[tuple[int, int], tuple[NDArray, NDArray] | None] = {}
+    known: dict[tuple[int, int], tuple[NDArray, NDArray, Array] | None] = {}
     shown = shown_objects(depsgraph.view_layer) if owners is None else set()
     for instance in depsgraph.object_instances:
         solid = instance.object
@@ -257,15 +275,16 @@ def _instances(depsgraph: bpy.types.Depsgraph, owners: set[int] | None, baked: b
             continue
         key = (solid.data.as_pointer(), solid.original.session_uid)
         if key not in known:
-            known[key] = _solid_arrays(solid)
+            known[key] = _solid_arrays(solid, coloured)
         arrays = known[key]
         matrix = as_array(instance.matrix_world)
         if arrays is not None and np.isfinite(matrix).all():
             yield *arrays, matrix
 
 
-def _solid_arrays(solid: bpy.types.Object) -> tuple[NDArray[np.float32], NDArray[np.int32]] | None:
-    """Local positions and triangles of an evaluated object; None where it has no faces."""
+def _solid_arrays(solid: bpy.types.Object, coloured: bool
+                  ) -> tuple[NDArray[np.float32], NDArray[np.int32], Array] | None:
+    """Local positions, triangles and their albedo (F, 3) of an evaluated object; None where it has no faces."""
     try:
         mesh = solid.to_mesh()
     except RuntimeError:  # Blender's way to say that the object has no geometry, as a second metaball
@@ -276,9 +295,11 @@ def _solid_arrays(solid: bpy.types.Object) -> tuple[NDArray[np.float32], NDArray
         if not len(mesh.polygons):
             return None
         positions = _positions(mesh)
-        triangles = _corner_vertices(mesh)[_triangle_corners(mesh)]
-        finite = np.isfinite(positions).all(axis=1)
-        return np.nan_to_num(positions), triangles[finite[triangles].all(axis=1)]
+        corners = _triangle_corners(mesh)
+        triangles = _corner_vertices(mesh)[corners]
+        whole = np.isfinite(positions).all(axis=1)[triangles].all(axis=1)
+        albedo = triangle_albedo(solid, mesh, corners)[whole] if coloured else np.zeros((0, 3))
+        return np.nan_to_num(positions), triangles[whole], albedo
     finally:
         solid.to_mesh_clear()
 

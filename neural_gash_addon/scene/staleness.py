@@ -41,7 +41,8 @@ def check(obj: bpy.types.Object) -> bool:
     try:
         record = read_record(obj)
         uv = read_uv(obj.data, record.uv_map) if record.uv_map else None
-        now = fingerprint(obj, bpy.context.evaluated_depsgraph_get(), record.occluders, uv)
+        now = fingerprint(obj, bpy.context.evaluated_depsgraph_get(), record.occluders, uv,
+                          record.colours == 3)
         current = same_fingerprint(now, record.fingerprint)
         check_whole(obj.data, record)
     except UserError:  # changed so far that it could not be baked again as it was

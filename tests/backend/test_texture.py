@@ -36,7 +36,7 @@ def lookup(result, uv):
     """Coefficients (n, K) at uv (n, 2), as a shader gets them."""
     side, filled = result.record.side, result.fill_map()
     images = [bilinear(result.image(i, filled).reshape(side, side, 4), uv)
-              for i in range(texture.image_count(result.record.order))]
+              for i in range(texture.image_count(result.record.terms))]
     return np.concatenate(images, 1)[:, :result.record.order ** 2]
 
 

@@ -30,7 +30,7 @@ def test_round_trip_is_exact(make, order, smooth):
     assert values.dtype == np.float32
     np.testing.assert_array_equal(values, transfer.coefficients[mesh.elements])
     assert record == transfer.record
-    assert len(_names(obj)) == attributes.attribute_count(order) == -(-order ** 2 // 4)
+    assert len(_names(obj)) == attributes.attribute_count(order ** 2) == -(-order ** 2 // 4)
     assert {obj.data.attributes[n].domain for n in _names(obj)} == {mesh.domain}
     assert json.loads(obj.data["neural_gash"])["order"] == order
 
