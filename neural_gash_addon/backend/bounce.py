@@ -25,8 +25,8 @@ from .patches import Patches
 from .raycast import Geometry, Occluders
 from .transfer import Transfer
 
-PATCHES = 16384       # about as many; more sharpen the light that bounces near edges and shadows
-PATCH_RAYS = 256
+PATCHES = 8192        # about as many; more sharpen the light that bounces near edges and shadows
+PATCH_RAYS = 128
 MIN_RAYS, MAX_RAYS = 64, 256  # of a point's gathering
 MAX_BOUNCES = 64
 INVISIBLE = 2e-3      # of all transfer: a bounce that adds less is the last

@@ -30,7 +30,7 @@ class Patches:
         self.normals = normals / np.maximum(double, 1e-300)[:, None]                     # (F, 3) of the fronts
         size = (self.areas.sum() / max(budget, 1)) ** 0.5
         edges = np.linalg.norm(self.corners - np.roll(self.corners, -1, 1), axis=2).max(1)
-        cuts = np.clip(np.ceil(edges / max(1.4 * size, 1e-300)), 1, _MOST_CUTS)
+        cuts = np.clip(np.ceil(edges / max(2.0 * size, 1e-300)), 1, _MOST_CUTS)
         self._cuts = np.where(self.areas > 0, cuts, 1).astype(np.int64)                  # (F,)
         self._start = np.concatenate([[0], np.cumsum(self._cuts ** 2)])                  # (F + 1,) of its pieces
         self.faces = np.repeat(np.arange(len(self._cuts)), self._cuts ** 2)              # (pieces,)
