@@ -58,7 +58,7 @@ settings = bpy.context.scene.neural_gash
 settings.target, settings.side, settings.order, settings.bounces = "TEXTURE", 64, 3, 2
 assert bpy.ops.neural_gash.bake() == {"FINISHED"}   # with xatlas, and embreex's hits
 images = bpy.context.object.data["neural_gash_images"]
-assert len(images.keys()) == 7 and all(images[key].packed_file for key in images.keys()), images
+assert len(images.keys()) == 7 and all(image.packed_file for image in images.values()), images
 assert not [name for name, _ in bpy.context.object.data.attributes.items() if name.startswith("_prt_")]
 assert bpy.ops.neural_gash.clear() == {"FINISHED"}
 assert not [image.name for image in bpy.data.images if "PRT" in image.name]
