@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from table import Table, interleaved, ratio, seconds
 from throughput import bare_seconds
 
-from neural_gash_addon.backend import exr, methods, texture
+from neural_gash_addon.backend import exr, gloss, methods, texture
 from neural_gash_addon.backend.geometry import Surface, TriangleMesh
 from neural_gash_addon.backend.raster import Layout
 from neural_gash_addon.backend.raycast import Occluders
@@ -52,8 +52,20 @@ def measure(table: Table, threads: int, quick: bool) -> None:
     uv = methods.run(unwrap(surface, side=SIDE)).uv
     spent = statistics.median(seconds(lambda: texels_of(surface, uv, SIDE)) for _ in range(3))
     table.add(f"{name}, {len(mesh.triangles):,} triangles: G-buffer", f"{spent:.2f} s", "", spent, 3, " s", most=True)
+    _gloss(table)
     if not quick:
         _memory(table)
+
+
+def _gloss(table: Table) -> None:
+    """What a glossy preview computes when its light changes."""
+    transfer = np.random.default_rng(0).normal(size=(SIDE * SIDE, ORDER ** 2)).astype(np.float32)
+    out = np.empty((-(-3 * (ORDER ** 2 + 1) // 4), SIDE * SIDE, 4), np.float32)
+    light = np.random.default_rng(1).normal(size=(ORDER ** 2, 3))
+    gloss.lit_channels(transfer, light, 4, out)  # warm
+    spent = statistics.median(seconds(lambda: gloss.lit_channels(transfer, light, 4, out)) for _ in range(5))
+    table.add(f"glossy preview, {SIDE} x {SIDE}, order {ORDER}: a new light, but for handing 20 images to Blender "
+              "(0.03 s)", f"{spent:.2f} s", "", spent, 0.25, " s", most=True)
 
 
 def _parts(table: Table, label: str, threads: int) -> None:

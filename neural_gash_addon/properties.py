@@ -12,7 +12,7 @@ from .backend.estimator import MAX_RAYS
 from .backend.methods import METHODS, MIN_ORDER, MIN_TOLERANCE
 from .backend.spherical_harmonics import MAX_ORDER
 from .backend.texture import MAX_SIDE, MIN_SIDE
-from .scene.lighting import apply_light
+from .scene.lighting import apply_light, show_gloss
 from .scene.read import SELF, VISIBLE
 
 RAYS, TOLERANCE, COLLECTION = "RAYS", "TOLERANCE", "COLLECTION"
@@ -22,6 +22,11 @@ VERTICES, TEXTURE, RESOLUTION, DENSITY = "VERTICES", "TEXTURE", "RESOLUTION", "D
 def _light_changed(settings: NeuralGashSettings, _context: bpy.types.Context) -> None:
     """A light slider moved: only the light constants of the previews change."""
     apply_light(settings.id_data)
+
+
+def _gloss_changed(settings: NeuralGashSettings, _context: bpy.types.Context) -> None:
+    """Glossy previews instead of dull ones, or the other way round."""
+    show_gloss(settings.id_data)
 
 
 class NeuralGashSettings(bpy.types.PropertyGroup):
@@ -88,6 +93,10 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
     light_strength: FloatProperty(  # type: ignore[valid-type]
         name="Strength", default=1.0, min=0.0, soft_max=10.0,
         description="Brighten or dim the light of the previews", update=_light_changed)
+    gloss: BoolProperty(  # type: ignore[valid-type]
+        name="Glossy", default=False, update=_gloss_changed,
+        description="Show what the materials mirror of the light, by their roughness, on objects baked to textures "
+                    "without bounces")
     soften: BoolProperty(  # type: ignore[valid-type]
         name="Reduce Ringing", default=False, update=_light_changed,
         description="Damp the dark and bright rings that a small bright light leaves at low orders; "

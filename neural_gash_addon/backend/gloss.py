@@ -9,16 +9,19 @@ section 3, equation 2; Ng et al. 2004), and with the light fixed through one mat
 """
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import spherical_harmonics as sh
+from .estimator import default_threads
 
 Array = NDArray[np.float64]
 
 _ROWS = 256       # of one small matrix product: its operands stay in the second-level cache
+_LIT_ROWS = 2048  # small enough for BLAS to stay on one thread
 _BLOCK = 1 << 16  # points at a time, so that memory does not grow with their number
 
 
@@ -97,6 +100,29 @@ def transferred(transfer: NDArray, light: NDArray, out: NDArray[np.float32] | No
                   out=target[:whole].reshape(-1, _ROWS, matrix.shape[1]))
         np.matmul(block[whole:], matrix, out=target[whole:])
     return out
+
+
+def lit_channels(transfer: NDArray[np.float32], light: NDArray, channels: int, out: NDArray[np.float32]) -> None:
+    """What a shader needs of a light at each point, a few channels an image: radiance, then `transferred`.
+
+    Args:
+        transfer: (N, K) C-contiguous. light: (K, 3), in the bake frame. channels: of an image.
+        out: (images, N, channels) C-contiguous, written to: in order T . L (3), L^p_k (K, 3), zeros.
+    """
+    count, coefficients = transfer.shape
+    matrix = np.zeros((coefficients, len(out) * channels), np.float32)
+    matrix[:, :3] = light
+    products = np.pi * light_matrix(light, sh.order_of(coefficients)).transpose(1, 0, 2)
+    matrix[:, 3:3 + 3 * coefficients] = products.reshape(coefficients, -1)
+    parts = np.ascontiguousarray(matrix.reshape(coefficients, len(out), channels).transpose(1, 0, 2))
+
+    def block(start: int) -> None:
+        rows = transfer[start:start + _LIT_ROWS]  # stays in the cache for all images
+        for image, part in zip(out, parts, strict=True):
+            np.matmul(rows, part, out=image[start:start + _LIT_ROWS])
+
+    with ThreadPoolExecutor(default_threads()) as pool:
+        list(pool.map(block, range(0, count, _LIT_ROWS)))
 
 
 def mirrored(view: NDArray, normals: NDArray) -> Array:

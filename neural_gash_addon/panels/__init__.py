@@ -98,6 +98,7 @@ class NEURAL_GASH_PT_light(_Panel, bpy.types.Panel):
         layout.prop(settings, "light_rotation")
         layout.prop(settings, "light_strength")
         layout.prop(settings, "soften")
+        layout.prop(settings, "gloss")
 
 
 class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):

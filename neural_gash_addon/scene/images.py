@@ -17,7 +17,7 @@ from ..backend.record import BakeRecord
 from ..backend.texture import TextureTransfer, image_count
 
 _IMAGES = "neural_gash_images"  # custom property of the mesh: its transfer images by number
-_RECORD = "neural_gash"         # custom property of an image: the record of the bake it belongs to
+RECORD = "neural_gash"         # custom property of an image: the record of the bake it belongs to
 
 
 def make_images(name: str, transfer: TextureTransfer, folder: Path | None, half: bool) -> list[bpy.types.Image]:
@@ -54,7 +54,7 @@ def detach(data: bpy.types.Mesh) -> None:
 
 def remove_unused(images: Iterable[bpy.types.Image]) -> None:
     """Delete those of some images that a bake made and nothing uses any more."""
-    for image in [i for i in images if _RECORD in i and i.users == 0]:
+    for image in [i for i in images if RECORD in i and i.users == 0]:
         bpy.data.images.remove(image)
 
 
@@ -73,7 +73,7 @@ def bake_images(data: bpy.types.Mesh, record: BakeRecord) -> list[bpy.types.Imag
             if not path.is_file():
                 raise UserError(f"The image '{image.name}' of the bake is missing ('{path}'); bake again.")
             text, _, _ = exr.read_record(path)
-            if text != image.get(_RECORD):
+            if text != image.get(RECORD):
                 raise UserError(f"The file '{path}' is of another bake than the object's; bake again.")
         if tuple(image.size) != (record.side, record.side):
             raise UserError(f"The image '{image.name}' has {image.size[0]} x {image.size[1]} texels, "
@@ -125,7 +125,7 @@ def _load(name: str, paths: list[Path], record: BakeRecord, half: bool) -> list[
         image.colorspace_settings.name = "Non-Color"
         image.alpha_mode = "CHANNEL_PACKED"
         image.use_half_precision = half
-        image[_RECORD] = record.to_json()
+        image[RECORD] = record.to_json()
         if bpy.data.is_saved:
             with suppress(ValueError):  # another drive, on Windows
                 image.filepath = bpy.path.relpath(str(path))

@@ -9,9 +9,9 @@ from bpy.app.handlers import persistent
 from ..backend import light as sh_light
 from ..backend import spherical_harmonics as sh
 from ..backend.errors import UserError
-from .attributes import read_record
+from .attributes import has_bake, read_record
 from .frames import as_array, bake_frame
-from .preview import is_on, update_light
+from .preview import is_glossy, is_on, preview_on, update_light
 from .world import rotated_light, world_light
 
 _turns: dict[int, bytes] = {}  # session uid of an object -> its rotation when its preview was last lit for turning
@@ -69,19 +69,40 @@ def register() -> None:
     """Start following objects that turn."""
     bpy.app.handlers.depsgraph_update_post.append(_on_change)
     bpy.app.handlers.frame_change_post.append(_on_change)
+    bpy.app.handlers.load_post.append(_on_load)
 
 
 def unregister() -> None:
     """Stop."""
     bpy.app.handlers.depsgraph_update_post.remove(_on_change)
     bpy.app.handlers.frame_change_post.remove(_on_change)
+    bpy.app.handlers.load_post.remove(_on_load)
     _turns.clear()
+
+
+def show_gloss(scene: bpy.types.Scene) -> None:
+    """Make the previews in a scene glossy or dull, as its settings have it."""
+    for obj in scene.objects:
+        if is_on(obj) and has_bake(obj) and not obj.library:
+            try:
+                preview_on(obj, scene.neural_gash.gloss)
+            except UserError:
+                continue  # a damaged bake keeps the preview it has; the panel says so
+    apply_light(scene)
+
+
+@persistent
+def _on_load(*_: object) -> None:
+    """The images of glossy previews are not saved: fill them again."""
+    for scene in bpy.data.scenes:
+        for obj in scene.objects:
+            if is_glossy(obj):
+                light_object(scene, obj)
 
 
 def light_object(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
     """Light the preview of one object, where it is on."""
     try:
-        order = read_record(obj).order
+        update_light(obj, current_light(scene, read_record(obj).order))
     except UserError:
-        return  # the panel says that the record is damaged
-    update_light(obj, current_light(scene, order))
+        return  # the panel says that the bake is damaged

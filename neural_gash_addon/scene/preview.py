@@ -16,6 +16,8 @@ from ..backend.errors import UserError
 from ..backend.geometry import TEXEL
 from .attributes import attribute_count, check_whole, has_bake, read_record
 from .frames import as_array, bake_frame
+from .gloss import can_gloss, gloss_group, light_gloss
+from .gloss_nodes import SPECULAR, is_gloss
 from .images import bake_images, remove_unused
 from .nodes import DEFAULT_ALBEDO, ensure_group, group_terms, is_group, set_light
 
@@ -30,9 +32,16 @@ def is_on(obj: bpy.types.Object | None) -> bool:
     return obj is not None and any(_state(slot.material) is not None for slot in obj.material_slots)
 
 
-def preview_on(obj: bpy.types.Object) -> None:
-    """Show the bake of `obj`, lit by a white sky until `update_light`.
+def is_glossy(obj: bpy.types.Object | None) -> bool:
+    """Whether the preview of the object is a glossy one."""
+    return obj is not None and any(is_gloss(node.node_tree) for node in _group_nodes(obj))
 
+
+def preview_on(obj: bpy.types.Object, glossy: bool = False) -> None:
+    """Show the bake of `obj`, lit by a white sky (glossy: dark) until `update_light`.
+
+    Args:
+        glossy: also the light that its materials mirror, where the bake allows that.
     Raises:
         UserError: there is no bake, its images are not whole, or a material's colour reads more
             attributes than EEVEE can draw beside the bake's.
@@ -44,7 +53,10 @@ def preview_on(obj: bpy.types.Object) -> None:
     if images and record.uv_map not in obj.data.uv_layers:
         raise UserError(f"The UV map '{record.uv_map}' of the bake of '{obj.name}' is gone; bake again.")
     preview_off(obj)
-    group = ensure_group(record.order, record.colours, images, record.uv_map if images else "")
+    if glossy and can_gloss(record):
+        group = gloss_group(obj.data, record)
+    else:
+        group = ensure_group(record.order, record.colours, images, record.uv_map if images else "")
     originals = [slot.material for slot in obj.material_slots] or [None]
     previews: list[bpy.types.Material] = []
     try:
@@ -110,13 +122,17 @@ def update_light(obj: bpy.types.Object, light: NDArray) -> None:
         raise ValueError(f"the light has {len(light)} coefficients, the bake {terms}")
     turn = np.array(record.frame).reshape(3, 3) @ bake_frame(obj).T
     seen = sh.rotate(np.asarray(light)[:terms], turn)
-    if any(group_terms(node.node_tree) != (record.order, record.colours) for node in _group_nodes(obj)):
+    if any(not is_gloss(node.node_tree) and group_terms(node.node_tree) != (record.order, record.colours)
+           for node in _group_nodes(obj)):
         preview_on(obj)  # baked again at another order
     for slot in obj.material_slots:
         if _state(slot.material) is not None and slot.material.users > 1:
             slot.material = slot.material.copy()  # a duplicated object, which may be turned differently
     for node in _group_nodes(obj):
-        set_light(node, seen)
+        if is_gloss(node.node_tree):
+            light_gloss(obj.data, record, node, seen, turn)
+        else:
+            set_light(node, seen)
 
 
 def _state(material: bpy.types.Material | None):
@@ -127,7 +143,8 @@ def _state(material: bpy.types.Material | None):
 def _group_nodes(obj: bpy.types.Object) -> list[bpy.types.Node]:
     """The shading group's nodes in the preview materials of `obj`."""
     return [node for slot in obj.material_slots if _state(slot.material) is not None
-            for node in slot.material.node_tree.nodes if node.type == "GROUP" and is_group(node.node_tree)]
+            for node in slot.material.node_tree.nodes
+            if node.type == "GROUP" and (is_group(node.node_tree) or is_gloss(node.node_tree))]
 
 
 def _has_nodes(material: bpy.types.Material) -> bool:
@@ -160,12 +177,46 @@ def _preview_material(original: bpy.types.Material | None, group: bpy.types.Node
     shading.inputs["Albedo"].default_value = colour
     if source is not None and source.is_linked:
         tree.links.new(source.links[0].from_socket, shading.inputs["Albedo"])
+    if is_gloss(group):
+        _set_gloss(tree, shading, None if source is None else source.node)
     output = tree.nodes.new("ShaderNodeOutputMaterial")
     output.location = (200, 0)
     tree.links.new(shading.outputs[0], output.inputs["Surface"])
     if hasattr(preview, "surface_render_method"):
         preview.surface_render_method = "DITHERED"  # the preview is opaque, whatever the original was
     return preview
+
+
+def _set_gloss(tree: bpy.types.NodeTree, shading: bpy.types.Node, shader: bpy.types.Node | None) -> None:
+    """Take roughness and metal from the material's own shader: dielectrics mirror 4 %, metals their colour."""
+    metallic = 0.0
+    if shader is not None and "Roughness" in shader.inputs:
+        rough = shader.inputs["Roughness"]
+        shading.inputs["Roughness"].default_value = rough.default_value
+        if rough.is_linked:
+            tree.links.new(rough.links[0].from_socket, shading.inputs["Roughness"])
+        if "Metallic" in shader.inputs and not shader.inputs["Metallic"].is_linked:
+            metallic = shader.inputs["Metallic"].default_value
+    else:
+        shading.inputs["Roughness"].default_value = 0.5
+    colour = shading.inputs["Albedo"]
+    mirrored = [SPECULAR + metallic * (value - SPECULAR) for value in colour.default_value[:3]]
+    shading.inputs["Specular"].default_value = (*mirrored, 1.0)
+    if metallic and colour.is_linked:
+        mix = tree.nodes.new("ShaderNodeMix")
+        mix.data_type = "RGBA"
+        mix.inputs[0].default_value = metallic
+        mix.inputs[6].default_value = (SPECULAR,) * 3 + (1.0,)
+        tree.links.new(colour.links[0].from_socket, mix.inputs[7])
+        tree.links.new(mix.outputs[2], shading.inputs["Specular"])
+    if metallic:
+        dim = tree.nodes.new("ShaderNodeVectorMath")
+        dim.operation = "SCALE"
+        dim.inputs[0].default_value = colour.default_value[:3]
+        dim.inputs["Scale"].default_value = 1 - metallic
+        if colour.is_linked:
+            tree.links.new(colour.links[0].from_socket, dim.inputs[0])
+        tree.links.new(dim.outputs[0], colour)
 
 
 def shown_material(material: bpy.types.Material | None) -> bpy.types.Material | None:
@@ -258,6 +309,6 @@ def _remove_unused(previews) -> None:
     for material in previews:
         if material.users == 0:
             bpy.data.materials.remove(material)
-    for group in [g for g in bpy.data.node_groups if is_group(g) and g.users == 0]:
+    for group in [g for g in bpy.data.node_groups if (is_group(g) or is_gloss(g)) and g.users == 0]:
         bpy.data.node_groups.remove(group)
     remove_unused(bpy.data.images)

@@ -241,3 +241,16 @@ def test_dark_where_nothing_arrives():
     d = directions(10)
     dark = gloss.transferred(np.zeros((10, 9)), np.ones((9, 3)))
     assert not gloss.reflected_radiance(dark, d, d, np.ones(3)).any()
+
+
+@pytest.mark.parametrize("count", [1, 5000])
+def test_channels_for_a_shader_are_radiance_and_products(count):
+    rng = np.random.default_rng(8)
+    transfer, light = rng.normal(size=(count, 25)).astype(np.float32), rng.normal(size=(25, 3))
+    out = np.full((20, count, 4), np.nan, np.float32)
+    gloss.lit_channels(transfer, light, 4, out)
+    numbers = out.transpose(1, 0, 2).reshape(count, 80)
+    np.testing.assert_allclose(numbers[:, :3], transfer @ light, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(numbers[:, 3:78].reshape(count, 25, 3), gloss.transferred(transfer, light), rtol=1e-4,
+                               atol=1e-3)
+    assert not numbers[:, 78:].any()
