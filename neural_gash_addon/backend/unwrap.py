@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ _FILLED = 0.65         # of the texture, at the first try of packing
 _BESIDE = 1.5          # texels that a chart takes beside its area and padding, each way
 _SHRINK = 0.94         # of the texels a metre, from one try to the next
 _TRIES = 16
+Result = TypeVar("Result")
 _REPAIRS = 3           # times that faces which lie over each other are laid out anew, each alone
 _FLAT = 1e-10          # of a face's area that is left in UVs: less, and it has collapsed
 
@@ -59,25 +61,6 @@ def unwrap(surface: Surface, *, side: int | None, texels_per_metre: float | None
     except ImportError as error:
         raise UserError("Textures need the Python package xatlas, which this Blender's Python has not; "
                         "bake to vertices, or to a UV map of your own.") from error
-    apart = np.zeros(len(surface.corners), bool)
-    for number in range(_REPAIRS):
-        unwrapping = _unwrap(xatlas, surface, side, texels_per_metre, padding, apart)
-        try:
-            while True:
-                share = next(unwrapping)
-                yield 0.9 * share if not number else 0.9
-        except StopIteration as end:
-            atlas: Atlas = end.value
-        pairs = Layout(atlas.uv[surface.corners], surface.triangles, min(atlas.side, CHECKED_SIDE)).overlapping()
-        if not len(pairs):
-            break
-        apart[pairs.ravel()] = True  # charts that lie over themselves
-    return atlas
-
-
-def _unwrap(xatlas, surface: Surface, side: int | None, texels_per_metre: float | None, padding: int,
-            apart: NDArray[np.bool_]) -> Generator[float, None, Atlas]:
-    """`unwrap` once, with the polygons of the triangles `apart` (F,) laid out alone."""
     positions, triangles, corners = surface.positions, surface.triangles, surface.corners
     normals, polygons = surface.corner_normals, surface.polygons
     local = np.zeros((len(triangles), 3, 2))  # metres, each piece in a plane of its own
@@ -86,17 +69,33 @@ def _unwrap(xatlas, surface: Surface, side: int | None, texels_per_metre: float 
     for number, piece in enumerate(pieces):
         local[piece], found = _chart(xatlas, positions, triangles[piece], normals[corners[piece]])
         areas += found
-        yield 0.8 * (number + 1) / len(pieces)
-    alone = _torn(local, positions, triangles, corners, polygons)
-    alone |= np.isin(polygons, polygons[apart])
-    if alone.any():
-        local[alone] = _laid_flat(positions[triangles[alone]], polygons[alone])
-        pieces = [kept for piece in pieces if len(kept := piece[~alone[piece]])] + [np.flatnonzero(alone)]
+        yield 0.7 * (number + 1) / len(pieces)
     density = _density(np.array(areas), side, padding) if side else texels_per_metre or 1.0
-    uv, side, charts = yield from _pack(xatlas, local, pieces, side, density, padding)
-    of_corner = np.zeros((len(normals), 2))
-    of_corner[corners] = uv
-    return Atlas(of_corner, side, charts, len(np.unique(polygons[alone])))
+    alone = _torn(local, positions, triangles, corners, polygons)
+    uv = np.zeros((len(normals), 2))
+    for number in range(_REPAIRS):
+        groups = [kept for piece in pieces if len(kept := piece[~alone[piece]])]
+        if alone.any():
+            local[alone] = _laid_flat(positions[triangles[alone]], polygons[alone])
+            groups.append(np.flatnonzero(alone))
+        packing = _pack(xatlas, local, groups, side, density, padding)
+        placed, found_side, charts, fits = yield from _scaled(packing, 0.7 + 0.1 * number, 0.1)
+        uv[corners] = placed
+        density *= fits  # the next try begins where this one ended
+        pairs = Layout(placed, triangles, min(found_side, CHECKED_SIDE)).overlapping()
+        if not len(pairs):
+            break
+        alone |= np.isin(polygons, polygons[pairs])  # of charts that lie over themselves
+    return Atlas(uv, found_side, charts, len(np.unique(polygons[alone])))
+
+
+def _scaled(work: Generator[float, None, Result], start: float, share: float) -> Generator[float, None, Result]:
+    """Run a part of the unwrapping as progress start..start+share of the whole."""
+    try:
+        while True:
+            yield start + share * next(work)
+    except StopIteration as end:
+        return end.value
 
 
 def _pieces(positions: NDArray, triangles: NDArray, polygons: NDArray) -> list[NDArray[np.int64]]:
@@ -214,8 +213,8 @@ def _laid_flat(points: NDArray, polygons: NDArray) -> NDArray[np.float64]:
 
 
 def _pack(xatlas, local: NDArray, pieces: list[NDArray[np.int64]], side: int | None, density: float, padding: int
-          ) -> Generator[float, None, tuple[NDArray, int, int]]:
-    """(F, 3, 2) UVs 0 to 1 of all charts in one texture, its side, and the number of charts."""
+          ) -> Generator[float, None, tuple[NDArray, int, int, float]]:
+    """(F, 3, 2) UVs 0 to 1 of all charts in one texture, its side, the number of charts, and how much they shrank."""
     scaled = local * density  # in texels, as xatlas's tolerances are absolute
     meshes = []
     for piece in pieces:
@@ -223,7 +222,7 @@ def _pack(xatlas, local: NDArray, pieces: list[NDArray[np.int64]], side: int | N
         meshes.append((places.astype(np.float32), index.reshape(-1, 3).astype(np.uint32)))
     scale = 1.0
     for number in range(_TRIES):
-        yield 0.85 + 0.15 * number / _TRIES
+        yield number / _TRIES
         atlas = xatlas.Atlas()  # a new one: packing again would find the charts of the time before
         for mesh in meshes:
             atlas.add_uv_mesh(*mesh)
@@ -243,4 +242,4 @@ def _pack(xatlas, local: NDArray, pieces: list[NDArray[np.int64]], side: int | N
     for number, piece in enumerate(pieces):
         _, indices, uv = atlas.get_mesh(number)
         out[piece] = (uv * size)[indices]
-    return out, side, int(atlas.chart_count)
+    return out, side, int(atlas.chart_count), scale

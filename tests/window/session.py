@@ -182,6 +182,7 @@ def session():
     yield from cancelled()
     yield from baked()
     yield from reopened()
+    yield from textured()
     yield from deleted()
 
 
@@ -326,6 +327,37 @@ def reopened():
     yield 2
     expect(staleness.status(suzanne()) == staleness.STALE, "changed_is_seen")
     yield from picture("8_changed")
+
+
+def textured():
+    """A floor baked to a texture with a bounce, stopped once by Esc; shown glossy; the tiles on disk are gone after."""
+    with in_view():
+        bpy.ops.mesh.primitive_plane_add(size=4, location=(0, 0, -1))
+    floor = bpy.context.object
+    settings().target, settings().uv_map, settings().side = "TEXTURE", floor.data.uv_layers[0].name, 512
+    settings().occluders, settings().quality, settings().rays = "VISIBLE", "RAYS", 4096
+    settings().order, settings().method = 5, "embree"
+    tiles = Path(bpy.utils.extension_path_user(ID)) / "tiles"
+    bake()
+    yield 1.5
+    press("ESC")
+    yield from until_idle(10)
+    expect("neural_gash" not in floor.data, "texture_esc_leaves_no_trace")
+    settings().rays = 64
+    bake()
+    yield from until_idle(120)
+    expect(len(floor.data.get("neural_gash_images", {}).keys()) == 7, "texture_baked")
+    expect(not [p for folder in tiles.iterdir() for p in folder.iterdir()] if tiles.is_dir() else True, "tiles_removed")
+    settings().gloss = True
+    yield 0.5
+    group = next(n.node_tree.name for n in floor.material_slots[0].material.node_tree.nodes if n.type == "GROUP")
+    expect(group.startswith("PRT Gloss"), "gloss_shown")
+    view3d()[1].spaces.active.shading.type = "MATERIAL"
+    yield 8
+    yield from picture("8b_texture_gloss")
+    view3d()[1].spaces.active.shading.type = "SOLID"
+    settings().target, settings().gloss, settings().occluders = "VERTICES", False, "SELF"
+    settings().quality = "TOLERANCE"
 
 
 def deleted():
