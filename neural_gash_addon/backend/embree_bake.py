@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from . import spherical_harmonics as sh
 from .estimator import MAX_RAYS, BlockedEstimator, default_threads, morton_order
 from .geometry import TriangleMesh
+from .progress import scaled
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
 from .transfer import Transfer
@@ -24,8 +24,6 @@ KEPT = 0.7              # squared error left after a doubling, as a part of the 
 POOL = 9                # neighbours along the Z-order curve whose error estimates are averaged
 REPLICATES = 1024       # points baked twice to measure the error, or a 32nd of them if that is more
 _MAX_REPLICATES = 8192
-
-Result = TypeVar("Result")
 
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
@@ -54,26 +52,15 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
             done, share = start / len(lit), len(block) / len(lit)
             work = _trace_block(estimator, block, order, rays, None if scale is None or tolerance is None
                                 else (tolerance * scale) ** 2, pool, threads)
-            coefficients[block], rays_of_point[block] = yield from _scaled(work, 0.95 * done, 0.95 * share)
+            coefficients[block], rays_of_point[block] = yield from scaled(work, 0.95 * done, 0.95 * share)
         if len(lit):
             work_error = _measured_error(mesh, scene, order, seed, coefficients, rays_of_point, lit, pool, threads)
-            error, extra = yield from _scaled(work_error, 0.95, 0.05)
+            error, extra = yield from scaled(work_error, 0.95, 0.05)
             probes += extra
     return Transfer(coefficients, BakeRecord(
         method="embree", order=order, points=count, domain=mesh.domain, seed=seed,
         rays=int(rays_of_point.sum(dtype=np.int64)), probe_rays=probes,
         seconds=time.perf_counter() - began, error_estimate=error, tolerance=tolerance))
-
-
-def _scaled(work: Generator[float, None, Result], start: float, share: float) -> Generator[float, None, Result]:
-    """Run a part of the bake as progress start..start+share of the whole."""
-    try:
-        while True:
-            yield start + share * next(work)
-    except StopIteration as end:
-        return end.value
-    finally:
-        work.close()
 
 
 def _pilot(estimator: BlockedEstimator, lit: NDArray, order: int, pool: ThreadPoolExecutor, threads: int
@@ -106,7 +93,7 @@ def _trace_block(estimator: BlockedEstimator, block: NDArray, order: int, rays: 
     while len(active):
         points = block[active]
         fresh = np.zeros((len(active), sums.shape[1]))
-        yield from _scaled(estimator.trace(pool, threads, points, start, stop, fresh), 1 - left, left / 2)
+        yield from scaled(estimator.trace(pool, threads, points, start, stop, fresh), 1 - left, left / 2)
         left /= 2
         sums[active] += fresh
         now = estimator.means(points, sums[active], 0, stop)

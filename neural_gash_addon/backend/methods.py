@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
@@ -15,11 +14,11 @@ from .bounce import Reflection
 from .errors import UserError
 from .estimator import MAX_RAYS
 from .geometry import TriangleMesh
+from .progress import Result, scaled
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
 from .transfer import Transfer
 
-Result = TypeVar("Result")
 Baking = Generator[float, None, Transfer]
 MIN_ORDER = 2
 MIN_TOLERANCE = 1e-4
@@ -105,21 +104,8 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
 def _with_bounces(direct: Baking, mesh: TriangleMesh, occluders: Sequence[Geometry], scene: Occluders,
                   threads: int | None, reflection: Reflection) -> Baking:
     """A bake of direct transfer, and then what bounces add to it."""
-    try:
-        while True:
-            yield 0.6 * next(direct)
-    except StopIteration as end:
-        transfer: Transfer = end.value
-    finally:
-        direct.close()
-    adding = reflection.add(transfer, mesh, occluders, scene, threads)
-    try:
-        while True:
-            yield 0.6 + 0.4 * next(adding)
-    except StopIteration as end:
-        return end.value
-    finally:
-        adding.close()
+    transfer = yield from scaled(direct, 0, 0.6)
+    return (yield from scaled(reflection.add(transfer, mesh, occluders, scene, threads), 0.6, 0.4))
 
 
 def run(baking: Generator[float, None, Result], progress: Callable[[float], None] | None = None) -> Result:

@@ -16,11 +16,12 @@ from .bounce import Reflection
 from .errors import UserError
 from .exchange import atomic, reason
 from .geometry import Surface
+from .progress import scaled
 from .raster import CHECKED_SIDE, Layout
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
 from .texels import NormalMap, fill_map, texel_points
-from .unwrap import Atlas, unwrap
+from .unwrap import unwrap
 
 CHANNELS = 4             # coefficients that one image holds
 MIN_SIDE, MAX_SIDE = 16, 8192
@@ -87,7 +88,8 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
     start_at = 0.0
     if uv is None:
         start_at = _ATLAS_SHARE
-        atlas = yield from _scaled(unwrap(surface, side=side, texels_per_metre=texels_per_metre, padding=padding))
+        atlas = yield from scaled(
+            unwrap(surface, side=side, texels_per_metre=texels_per_metre, padding=padding), 0, _ATLAS_SHARE)
         uv, side = atlas.uv, atlas.side
         _check_side(side, None)
     elif len(pairs := Layout(uv[surface.corners], surface.triangles, min(side or 0, CHECKED_SIDE)).overlapping()):
@@ -112,13 +114,8 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
                 scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
             baking = methods.bake(mesh, method, order, rays=rays, tolerance=tolerance, seed=_tile_seed(seed, number),
                                   occluders=occluders, threads=threads, scene=scene, reflection=reflection)
-            try:
-                while True:
-                    yield done + share * next(baking)
-            except StopIteration as end:
-                found = end.value.coefficients.reshape(len(mesh.points), -1), end.value.record
-            finally:
-                baking.close()
+            transfer = yield from scaled(baking, done, share)
+            found = transfer.coefficients.reshape(len(mesh.points), -1), transfer.record
             if store:
                 found = store.save(number, *found)
         texels.append(coverage.texels)
@@ -136,17 +133,6 @@ def _check_side(side: int | None, texels_per_metre: float | None) -> None:
             raise UserError("Give a resolution, or a positive number of texels per metre.")
     elif not MIN_SIDE <= side <= MAX_SIDE:
         raise UserError(f"The resolution must be {MIN_SIDE} to {MAX_SIDE} texels, not {side}.")
-
-
-def _scaled(unwrapping: Generator[float, None, Atlas]) -> Generator[float, None, Atlas]:
-    """Unwrap as the first part of the bake."""
-    try:
-        while True:
-            yield _ATLAS_SHARE * next(unwrapping)
-    except StopIteration as end:
-        return end.value
-    finally:
-        unwrapping.close()
 
 
 def overlap_message(pairs: NDArray, polygons: NDArray) -> str:

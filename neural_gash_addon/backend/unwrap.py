@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from .errors import UserError
 from .estimator import morton_order
 from .geometry import Surface, unit
+from .progress import scaled
 from .raster import CHECKED_SIDE, Layout
 
 PIECE = 1000           # triangles that xatlas charts at a time: 40 ms at most
@@ -27,7 +27,6 @@ _FILLED = 0.65         # of the texture, at the first try of packing
 _BESIDE = 1.5          # texels that a chart takes beside its area and padding, each way
 _SHRINK = 0.94         # of the texels a metre, from one try to the next
 _TRIES = 16
-Result = TypeVar("Result")
 _REPAIRS = 3           # times that faces which lie over each other are laid out anew, each alone
 _FLAT = 1e-10          # of a face's area that is left in UVs: less, and it has collapsed
 
@@ -79,7 +78,7 @@ def unwrap(surface: Surface, *, side: int | None, texels_per_metre: float | None
             local[alone] = _laid_flat(positions[triangles[alone]], polygons[alone])
             groups.append(np.flatnonzero(alone))
         packing = _pack(xatlas, local, groups, side, density, padding)
-        placed, found_side, charts, fits = yield from _scaled(packing, 0.7 + 0.1 * number, 0.1)
+        placed, found_side, charts, fits = yield from scaled(packing, 0.7 + 0.1 * number, 0.1)
         uv[corners] = placed
         density *= fits  # the next try begins where this one ended
         pairs = Layout(placed, triangles, min(found_side, CHECKED_SIDE)).overlapping()
@@ -87,15 +86,6 @@ def unwrap(surface: Surface, *, side: int | None, texels_per_metre: float | None
             break
         alone |= np.isin(polygons, polygons[pairs])  # of charts that lie over themselves
     return Atlas(uv, found_side, charts, len(np.unique(polygons[alone])))
-
-
-def _scaled(work: Generator[float, None, Result], start: float, share: float) -> Generator[float, None, Result]:
-    """Run a part of the unwrapping as progress start..start+share of the whole."""
-    try:
-        while True:
-            yield start + share * next(work)
-    except StopIteration as end:
-        return end.value
 
 
 def _pieces(positions: NDArray, triangles: NDArray, polygons: NDArray) -> list[NDArray[np.int64]]:
