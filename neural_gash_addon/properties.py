@@ -85,7 +85,7 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
         name="16 Bits", default=False,
         description="Store half as much for each texel, exact to a thousandth; 32 bits keep every digit")
     texture_folder: StringProperty(  # type: ignore[valid-type]
-        name="Folder", default="", subtype="DIR_PATH",
+        name="Folder", default="", subtype="DIR_PATH", options={"PATH_SUPPORTS_BLEND_RELATIVE"},
         description="Where to write the textures as OpenEXR files; leave empty to pack them into the .blend file")
     light_rotation: FloatProperty(  # type: ignore[valid-type]
         name="Rotation", default=0.0, subtype="ANGLE", soft_min=-math.pi, soft_max=math.pi,
