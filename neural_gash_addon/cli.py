@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import bpy
@@ -19,8 +20,9 @@ from .backend import exchange, methods, shading
 from .backend import light as sh_light
 from .backend.errors import UserError
 from .backend.transfer import Transfer
-from .ops.job import finish, prepare, summary
-from .properties import COLLECTION, RAYS, RESOLUTION, TEXTURE, TOLERANCE, VERTICES, NeuralGashSettings
+from .ops.batch import finish_batch, prepare_batch
+from .ops.job import summary
+from .properties import COLLECTION, FIT, RAYS, RESOLUTION, TEXTURE, TOLERANCE, VERTICES, NeuralGashSettings
 from .scene import lighting
 from .scene.attributes import has_bake, read_record
 from .scene.preview import preview_on
@@ -48,7 +50,9 @@ def _parser() -> argparse.ArgumentParser:
     bake = commands.add_parser("bake", help="bake a mesh object of a file",
                                epilog=parser.epilog)
     bake.add_argument("input", metavar="INPUT", help=".blend, .obj, .ply, .glb or .stl")
-    bake.add_argument("--object", metavar="NAME", help="which object; needed where the file has several meshes")
+    bake.add_argument("--object", metavar="NAME", action="append", dest="objects",
+                      help="which object; needed where the file has several meshes. Give it again to bake several "
+                           "together, which shadow each other")
     bake.add_argument("--method", choices=list(methods.METHODS), default="embree")
     bake.add_argument("--order", type=int, default=3, help="bands of spherical harmonics, 2 to 5 (3)")
     quality = bake.add_mutually_exclusive_group()
@@ -57,7 +61,9 @@ def _parser() -> argparse.ArgumentParser:
     bake.add_argument("--occluders", default="self", metavar="self|visible|COLLECTION",
                       help="what casts shadows on the object (self)")
     bake.add_argument("--bounces", type=int, default=0, help="how often light may bounce between surfaces, at most (0)")
-    bake.add_argument("--texture", type=int, metavar="SIDE", help="bake to a texture of SIDE x SIDE texels instead")
+    bake.add_argument("--texture", type=_side, metavar="SIDE",
+                      help="bake to a texture of SIDE x SIDE texels instead; 'fit': as large as the tolerance needs")
+    bake.add_argument("--share", action="store_true", help="one texture for all objects, with --texture")
     bake.add_argument("--uv-map", metavar="NAME", default="", help="of the mesh, for --texture; else one is made")
     bake.add_argument("--textures", metavar="FOLDER", type=Path, help="write the textures as .exr there, not into OUT")
     bake.add_argument("--half", action="store_true", help="textures of 16 bits a channel instead of 32")
@@ -83,6 +89,11 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _side(text: str) -> int | str:
+    """A number of texels, or 'fit'."""
+    return text if text == "fit" else int(text)
+
+
 def main(argv: Sequence[str]) -> int:
     """Run a command line; the exit code."""
     try:
@@ -93,7 +104,10 @@ def main(argv: Sequence[str]) -> int:
         _check_outputs(arguments)
         with silent_blender():
             data, text = _COMMANDS[arguments.command](arguments)
-        print(json.dumps(data, sort_keys=True) if arguments.json else text, flush=True)
+        for entry in data:
+            if "error" in entry:
+                print(f"neural_gash: {entry['error']}", file=sys.stderr)
+        print("\n".join(json.dumps(entry, sort_keys=True) for entry in data) if arguments.json else text, flush=True)
     except UserError as error:
         print(f"neural_gash: {error}", file=sys.stderr)
         return BAD_INPUT
@@ -104,17 +118,20 @@ def main(argv: Sequence[str]) -> int:
     except KeyboardInterrupt:
         print("neural_gash: interrupted", file=sys.stderr)
         return INTERRUPTED
-    return OK
+    return BAD_INPUT if any("error" in entry for entry in data) else OK
 
 
-def _bake(arguments: argparse.Namespace) -> tuple[dict, str]:
+def _bake(arguments: argparse.Namespace) -> tuple[list[dict], str]:
     """`bake`."""
-    if arguments.texture is None and (arguments.uv_map or arguments.textures or arguments.half):
-        raise UserError("--uv-map, --textures and --half belong to a bake with --texture.")
+    if arguments.texture is None and (arguments.uv_map or arguments.textures or arguments.half or arguments.share):
+        raise UserError("--uv-map, --textures, --half and --share belong to a bake with --texture.")
+    if arguments.npz is not None and len(arguments.objects or ()) > 1:
+        raise UserError("--npz holds the points of one object; bake several one by one.")
     if arguments.texture is not None and arguments.npz is not None:
         raise UserError("--npz holds the points of a bake to vertices; a texture's are in its .exr files (--textures).")
     _open(arguments.input)
-    obj = _choose([o for o in bpy.context.scene.objects if o.type == "MESH"], arguments.object, "mesh")
+    meshes = [o for o in bpy.context.scene.objects if o.type == "MESH"]
+    objects = [_choose(meshes, name, "mesh") for name in dict.fromkeys(arguments.objects or [None])]
     settings = bpy.context.scene.neural_gash
     settings.method = arguments.method
     _set(settings, "order", arguments.order)
@@ -133,40 +150,47 @@ def _bake(arguments: argparse.Namespace) -> tuple[dict, str]:
     _set(settings, "bounces", arguments.bounces)
     if arguments.texture is not None:
         settings.target = TEXTURE
-        settings.sizing = RESOLUTION
-        _set(settings, "side", arguments.texture)
-        settings.uv_map, settings.half = arguments.uv_map, arguments.half
+        settings.sizing = FIT if arguments.texture == "fit" else RESOLUTION
+        if settings.sizing == RESOLUTION:
+            _set(settings, "side", arguments.texture)
+        settings.share, settings.uv_map, settings.half = arguments.share, arguments.uv_map, arguments.half
         settings.texture_folder = str(arguments.textures.absolute()) if arguments.textures else ""
     else:
         settings.target = VERTICES
     if arguments.applied_copy:
-        obj = make_applied_copy(obj, bpy.context.evaluated_depsgraph_get())
+        objects = [make_applied_copy(obj, bpy.context.evaluated_depsgraph_get()) for obj in objects]
         bpy.context.view_layer.update()
-    job = prepare(bpy.context, obj, settings, _tiles(arguments, obj.name))
-    transfer = methods.run(job.baking, _progress_bar())
-    record, warning = finish(bpy.context, job, transfer)
-    if warning:
-        print(f"neural_gash: {warning}", file=sys.stderr)
+    batch = prepare_batch(bpy.context, objects, settings, partial(_tiles, arguments))
+    results = methods.run(batch.baking, _progress_bar())
+    outcomes = finish_batch(bpy.context, batch, results)
+    for outcome in outcomes:
+        if outcome.record is not None and outcome.sentence:
+            print(f"neural_gash: {outcome.sentence}", file=sys.stderr)
     if arguments.npz:
-        assert isinstance(transfer, Transfer)
-        exchange.save_npz(arguments.npz.absolute(), job.read.mesh, Transfer(transfer.coefficients, record))
+        (job,), (transfer,), (outcome,) = batch.jobs, results, outcomes
+        assert isinstance(transfer, Transfer) and outcome.record is not None
+        exchange.save_npz(arguments.npz.absolute(), job.read.mesh, Transfer(transfer.coefficients, outcome.record))
     if arguments.png:
-        render_preview([obj], arguments.png.absolute(), camera=bpy.context.scene.camera)
+        baked = {outcome.name for outcome in outcomes if outcome.record is not None}
+        render_preview([o for o in objects if o.name in baked], arguments.png.absolute(),
+                       camera=bpy.context.scene.camera)
     if arguments.out:
         _save(arguments.out.absolute())
-    return {"object": obj.name, **asdict(record)}, f"{obj.name}: {summary(record)}."
+    return ([{"object": o.name, "error": o.sentence} if o.record is None else {"object": o.name, **asdict(o.record)}
+             for o in outcomes],
+            "\n".join(f"{o.name}: {summary(o.record)}." for o in outcomes if o.record is not None))
 
 
-def _tiles(arguments: argparse.Namespace, name: str) -> Path | None:
+def _tiles(arguments: argparse.Namespace, obj: bpy.types.Object) -> Path | None:
     """Beside the first output: finished tiles of a large texture, from which a killed bake goes on."""
     output = next((p for p in (arguments.textures, arguments.out, arguments.npz, arguments.png) if p is not None), None)
     if arguments.texture is None or output is None:
         return None
-    clean = "".join(c if c.isalnum() else "_" for c in name)
+    clean = "".join(c if c.isalnum() else "_" for c in obj.name)
     return output.absolute().parent / f".{output.stem}-{clean}.tiles"
 
 
-def _relight(arguments: argparse.Namespace) -> tuple[dict, str]:
+def _relight(arguments: argparse.Namespace) -> tuple[list[dict], str]:
     """`relight`."""
     suffix = Path(arguments.input).suffix.lower()
     if not math.isfinite(arguments.rotation) or not 0 <= arguments.strength < math.inf:
@@ -202,7 +226,7 @@ def _relight(arguments: argparse.Namespace) -> tuple[dict, str]:
         light, name = lighting.current_light(scene, record.order), obj.name
     else:
         raise UserError(f"'{arguments.input}' is neither a .blend nor a .npz.")
-    return {"object": name, "light": light.tolist()}, f"{name}: relit."
+    return [{"object": name, "light": light.tolist()}], f"{name}: relit."
 
 
 def _check_outputs(arguments: argparse.Namespace) -> None:

@@ -7,16 +7,17 @@ import math
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
+from .backend.atlas import MAX_SIDE, MIN_SIDE
 from .backend.bounce import MAX_BOUNCES
 from .backend.estimator import MAX_RAYS
 from .backend.methods import METHODS, MIN_ORDER, MIN_TOLERANCE
 from .backend.spherical_harmonics import MAX_ORDER
-from .backend.texture import MAX_SIDE, MIN_SIDE
 from .scene.lighting import apply_light, show_gloss
 from .scene.read import SELF, VISIBLE
 
 RAYS, TOLERANCE, COLLECTION = "RAYS", "TOLERANCE", "COLLECTION"
-VERTICES, TEXTURE, RESOLUTION, DENSITY = "VERTICES", "TEXTURE", "RESOLUTION", "DENSITY"
+VERTICES, TEXTURE = "VERTICES", "TEXTURE"
+RESOLUTION, DENSITY, FIT = "RESOLUTION", "DENSITY", "FIT"
 
 
 def _light_changed(settings: NeuralGashSettings, _context: bpy.types.Context) -> None:
@@ -52,7 +53,7 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
         description="Rays to trace from every point")
     occluders: EnumProperty(  # type: ignore[valid-type]
         name="Occluders", description="What casts shadows on the object", default=SELF,
-        items=[(SELF, "Itself", "Only the object shadows itself"),
+        items=[(SELF, "Itself", "The object shadows itself, and objects that are baked together shadow each other"),
                (VISIBLE, "Visible Objects", "Everything visible in the viewport and in renders casts shadows"),
                (COLLECTION, "Collection", "The objects of a collection cast shadows")])
     collection: PointerProperty(  # type: ignore[valid-type]
@@ -68,7 +69,8 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
     sizing: EnumProperty(  # type: ignore[valid-type]
         name="Size", description="What decides the size of the texture", default=RESOLUTION,
         items=[(RESOLUTION, "Resolution", "A number of texels a side"),
-               (DENSITY, "Density", "A number of texels a metre; the texture is as large as that takes")])
+               (DENSITY, "Density", "A number of texels a metre; the texture is as large as that takes"),
+               (FIT, "Fit", "As large as the shadows on the object need for the tolerance; this is measured")])
     side: IntProperty(  # type: ignore[valid-type]
         name="Resolution", default=1024, min=MIN_SIDE, max=MAX_SIDE, subtype="PIXEL",
         description="Width and height of the texture in texels")
@@ -81,6 +83,9 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
     uv_map: StringProperty(  # type: ignore[valid-type]
         name="UV Map", default="",
         description="A UV map of the mesh to bake to, in which no faces overlap; leave empty to have one made")
+    share: BoolProperty(  # type: ignore[valid-type]
+        name="Share One Texture", default=False,
+        description="Objects that are baked together get one texture for all; else each gets its own")
     half: BoolProperty(  # type: ignore[valid-type]
         name="16 Bits", default=False,
         description="Store half as much for each texel, exact to a thousandth; 32 bits keep every digit")

@@ -32,6 +32,10 @@ class Coverage:
     barycentric: NDArray[np.float64]  # (n, 3) of the nearest point of the triangle to the texel's centre
     centres: NDArray[np.float64]      # (n, 3) of the centre itself: the same inside, beyond 0..1 in the border
 
+    def only(self, rows: NDArray[np.int64]) -> Coverage:
+        """Some of the texels, by rising row of these arrays."""
+        return Coverage(self.side, self.texels[rows], self.faces[rows], self.barycentric[rows], self.centres[rows])
+
 
 class Layout:
     """Triangles laid out in a square texture; tells what its texels cover, some rows at a time."""

@@ -36,7 +36,7 @@ class BakeRecord:
     error_estimate: float | None      # rel L2, measured; None: nothing was sampled
     probe_rays: int = 0               # traced besides, to measure the error and set the tolerance's scale
     tolerance: float | None = None    # rel L2 that was asked for; None: a ray count was
-    occluders: str = "SELF"           # 'SELF', 'VISIBLE' or a collection's name
+    occluders: str = "SELF"           # 'SELF', 'VISIBLE', a collection's name, or a JSON list of objects
     fingerprint: str = ""             # of the shape and its occluders
     frame: tuple[float, ...] = IDENTITY  # (9,) row-major rotation of the object at bake time
     target: str = "vertices"          # or 'texture'

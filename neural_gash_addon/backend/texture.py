@@ -2,6 +2,7 @@
 """Transfer textures (PRTT, algorithm 1): a bake of the texels, some rows at a time, that can be resumed."""
 from __future__ import annotations
 
+import hashlib
 import re
 import time
 from collections.abc import Generator, Sequence
@@ -12,20 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import methods
+from .atlas import Part, place
 from .bounce import Reflection
 from .errors import UserError
 from .exchange import atomic, reason
 from .geometry import Surface
 from .progress import scaled
-from .raster import CHECKED_SIDE, Layout
+from .raster import Layout
 from .raycast import Geometry, Occluders
-from .record import BakeRecord
+from .record import IDENTITY, BakeRecord
 from .texels import NormalMap, fill_map, texel_points
-from .unwrap import unwrap
 
 CHANNELS = 4             # coefficients that one image holds
-MIN_SIDE, MAX_SIDE = 16, 8192
-_ATLAS_SHARE = 0.1       # of the progress
+_LAYOUT_SHARE = 0.1      # of the progress
 _TILE = 1 << 18          # texels of a tile, covered or not: some seconds of work
 _OURS = re.compile(r"\d{4}\.(npy|json)")
 _JOB = "job.json"
@@ -38,6 +38,7 @@ class TextureTransfer:
     uv: NDArray[np.float64]                  # (C, 2) of each face corner
     texels: list[NDArray[np.int64]]          # of each tile, (n,) row * side + column
     coefficients: list[NDArray[np.float32]]  # of each tile, (n, K); coloured ones (n, 3K), red, green, blue of each
+    inside: list[NDArray[np.bool_]]          # of each tile, (n,) texels whose centre is on the mesh, not beside
     record: BakeRecord
 
     def fill_map(self) -> NDArray[np.int64]:
@@ -64,9 +65,9 @@ def image_count(terms: int) -> int:
 
 def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArray | None = None,
          side: int | None = None, texels_per_metre: float | None = None, padding: int = 2, rays: int | None = None,
-         tolerance: float | None = None, occluders: Sequence[Geometry] = (), normal_maps: Sequence[NormalMap] = (),
-         seed: int = 0, threads: int | None = None, folder: Path | None = None, key: str = "",
-         reflection: Reflection | None = None) -> Generator[float, None, TextureTransfer]:
+         tolerance: float | None = None, occluders: Sequence[Geometry] = (),
+         normal_maps: Sequence[NormalMap] = (), seed: int = 0, threads: int | None = None, folder: Path | None = None,
+         key: str = "", reflection: Reflection | None = None) -> Generator[float, None, TextureTransfer]:
     """Bake the transfer of a texture's texels.
 
     Args:
@@ -84,26 +85,18 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
         UserError: arguments out of range, UVs outside the texture, or faces that overlap in it.
     """
     began = time.perf_counter()
-    _check_side(side, texels_per_metre)
-    start_at = 0.0
-    if uv is None:
-        start_at = _ATLAS_SHARE
-        atlas = yield from scaled(
-            unwrap(surface, side=side, texels_per_metre=texels_per_metre, padding=padding), 0, _ATLAS_SHARE)
-        uv, side = atlas.uv, atlas.side
-        _check_side(side, None)
-    elif len(pairs := Layout(uv[surface.corners], surface.triangles, min(side or 0, CHECKED_SIDE)).overlapping()):
-        raise UserError(overlap_message(pairs, surface.polygons))
-    assert side is not None
+    placing = place([Part(surface, uv)], side=side, texels_per_metre=texels_per_metre, padding=padding)
+    (uv,), side = yield from scaled(placing, 0, _LAYOUT_SHARE)
     layout = Layout(uv[surface.corners], surface.triangles, side)
-    store = _Store(folder, key) if folder is not None else None
+    digest = hashlib.blake2b(uv.tobytes(), digest_size=16).hexdigest()
+    store = _Store(folder, f"{key} {side} {digest}") if folder is not None else None
     scene: Occluders | None = None
     rows = max(1, _TILE // side)
-    texels, coefficients, records = [], [], []
+    texels, coefficients, inside, records = [], [], [], []
     for number, start in enumerate(range(0, side, rows)):
         stop = min(start + rows, side)
         coverage = layout.coverage(start, stop)
-        done, share = start_at + (1 - start_at) * start / side, (1 - start_at) * (stop - start) / side
+        done, share = _LAYOUT_SHARE + (1 - _LAYOUT_SHARE) * start / side, (1 - _LAYOUT_SHARE) * (stop - start) / side
         yield done
         if not len(coverage.texels):
             continue
@@ -120,44 +113,62 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
                 found = store.save(number, *found)
         texels.append(coverage.texels)
         coefficients.append(found[0])
+        inside.append(np.all(coverage.barycentric == coverage.centres, axis=1))
         records.append(found[1])
     if not texels:
         raise UserError("The UVs leave no face any room in the texture, so there is nothing to bake.")
-    return TextureTransfer(uv, texels, coefficients, _whole(records, coefficients, seed, side, began))
+    record = replace(_whole(records, [_energy(c) for c in coefficients]), seconds=time.perf_counter() - began,
+                     seed=seed, target="texture", side=side)
+    return TextureTransfer(uv, texels, coefficients, inside, record)
 
 
-def _check_side(side: int | None, texels_per_metre: float | None) -> None:
-    """UserError unless a texture of this size can be baked."""
-    if side is None:
-        if not (texels_per_metre is not None and 0 < texels_per_metre < np.inf):
-            raise UserError("Give a resolution, or a positive number of texels per metre.")
-    elif not MIN_SIDE <= side <= MAX_SIDE:
-        raise UserError(f"The resolution must be {MIN_SIDE} to {MAX_SIDE} texels, not {side}.")
+def alike(transfers: Sequence[TextureTransfer]) -> list[TextureTransfer]:
+    """The same, all of them coloured if one is, so that one texture can hold them."""
+    colours = max(t.record.colours for t in transfers)
+    return [t if t.record.colours == colours else
+            replace(t, coefficients=[np.repeat(c, colours, axis=1) for c in t.coefficients],
+                    record=replace(t.record, colours=colours)) for t in transfers]
 
 
-def overlap_message(pairs: NDArray, polygons: NDArray) -> str:
-    """A sentence that names faces which claim the same texels; pairs: (m, 2) triangles."""
-    faces = np.unique(np.sort(polygons[pairs], axis=1), axis=0)
-    named = ", ".join(f"{a} and {b}" for a, b in faces[:5])
-    more = f" and {len(faces) - 5:,} more pairs" if len(faces) > 5 else ""
-    return (f"Faces lie over each other in the UV map ({named}{more}), so they cannot have shadows of their own; "
-            "unwrap them apart, or let the bake make its own UV map.")
+def merged(transfers: Sequence[TextureTransfer]) -> TextureTransfer:
+    """The texels of several meshes that share a texture, and a record of all.
+
+    A texel beside one mesh may be inside another, whose it is. The UVs are the first mesh's.
+    Fingerprint and frame are each mesh's own, and not in the record.
+    """
+    first = transfers[0]
+    owner = np.full(first.record.side ** 2, -1)
+    for number, transfer in enumerate(transfers):
+        for texels, inside in zip(transfer.texels, transfer.inside, strict=True):
+            owner[texels[inside]] = number
+    kept = [(texels[keep], coefficients[keep], inside[keep])
+            for number, t in enumerate(transfers)
+            for texels, coefficients, inside in zip(t.texels, t.coefficients, t.inside, strict=True)
+            for keep in [(owner[texels] == number) | (owner[texels] < 0)]]
+    record = _whole([t.record for t in transfers], [sum(map(_energy, t.coefficients)) for t in transfers])
+    record = replace(record, seconds=sum(t.record.seconds for t in transfers), fingerprint="", uv_map="",
+                     frame=IDENTITY, bounces=max(t.record.bounces for t in transfers))
+    return TextureTransfer(first.uv, [k[0] for k in kept], [k[1] for k in kept], [k[2] for k in kept], record)
 
 
 def _tile_seed(seed: int, number: int) -> int:
     return int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
 
 
-def _whole(records: list[BakeRecord], coefficients: list[NDArray], seed: int, side: int, began: float) -> BakeRecord:
-    """One record of all tiles."""
-    energy = np.array([np.square(c, dtype=np.float64).sum() for c in coefficients])
+def _energy(coefficients: NDArray) -> float:
+    """Sum of squares."""
+    return float(np.square(coefficients, dtype=np.float64).sum())
+
+
+def _whole(records: Sequence[BakeRecord], energies: Sequence[float]) -> BakeRecord:
+    """One record of all parts of a texture, whose coefficients have these energies."""
+    energy = np.array(energies)
     errors = [r.error_estimate for r in records]
     error = None
     if all(e is not None for e in errors):
         error = float((np.square(np.array(errors, float)) * energy).sum() / max(energy.sum(), 1e-300)) ** 0.5
     return replace(records[0], points=sum(r.points for r in records), rays=sum(r.rays for r in records),
-                   probe_rays=sum(r.probe_rays for r in records), seconds=time.perf_counter() - began,
-                   error_estimate=error, seed=seed, target="texture", side=side)
+                   probe_rays=sum(r.probe_rays for r in records), error_estimate=error)
 
 
 class _Store:

@@ -9,7 +9,7 @@ default options, and a window gets its turn between the pieces.
 """
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,20 +32,82 @@ _FLAT = 1e-10          # of a face's area that is left in UVs: less, and it has 
 
 
 @dataclass(frozen=True, eq=False)
+class Charts:
+    """The faces of one or several meshes cut into charts, each flat in a plane of its own; not in a texture yet."""
+
+    local: NDArray[np.float64]        # (F, 3, 2) of each triangle's corners, metres
+    positions: NDArray[np.float64]    # (V, 3)
+    triangles: NDArray[np.int32]      # (F, 3)
+    corners: NDArray[np.int32]        # (F, 3) face corners
+    polygons: NDArray[np.int32]       # (F,)
+    corner_count: int                 # C, of the mesh or of all together
+    pieces: list[NDArray[np.int64]]   # triangles whose charts were cut together
+    areas: NDArray[np.float64]        # of the charts, square metres
+    alone: NDArray[np.bool_]          # (F,) triangles of polygons that xatlas cannot chart
+
+    @staticmethod
+    def joined(parts: Sequence[Charts], scales: Sequence[float]) -> Charts:
+        """The charts of several meshes, each as large as `scales` says, their corners counted on."""
+        vertices, faces, corners, polygons = (
+            np.concatenate([[0], np.cumsum(counts)]) for counts in (
+                [len(p.positions) for p in parts], [len(p.triangles) for p in parts],
+                [p.corner_count for p in parts], [int(p.polygons.max()) + 1 for p in parts]))
+        return Charts(
+            np.concatenate([p.local * scale for p, scale in zip(parts, scales, strict=True)]),
+            np.concatenate([p.positions * scale for p, scale in zip(parts, scales, strict=True)]),
+            np.concatenate([p.triangles + n for p, n in zip(parts, vertices, strict=False)]),
+            np.concatenate([p.corners + n for p, n in zip(parts, corners, strict=False)]),
+            np.concatenate([p.polygons + n for p, n in zip(parts, polygons, strict=False)]),
+            int(corners[-1]), [piece + n for p, n in zip(parts, faces, strict=False) for piece in p.pieces],
+            np.concatenate([p.areas * scale ** 2 for p, scale in zip(parts, scales, strict=True)]),
+            np.concatenate([p.alone for p in parts]))
+
+
+@dataclass(frozen=True, eq=False)
 class Atlas:
     """UVs, and what it took to get them."""
 
     uv: NDArray[np.float64]  # (C, 2) of each face corner, 0 to 1
     side: int                # texels a side
+    texels_per_metre: float
     charts: int
     single_faces: int        # faces that were laid out alone, as xatlas could not chart them
 
 
 def unwrap(surface: Surface, *, side: int | None, texels_per_metre: float | None = None, padding: int = 2,
            ) -> Generator[float, None, Atlas]:
-    """Lay out the faces of a mesh in a square texture, without overlaps.
+    """`cut` and `lay_out` in one."""
+    charts = yield from scaled(cut(surface), 0, 0.7)
+    return (yield from scaled(lay_out(charts, side=side, texels_per_metre=texels_per_metre, padding=padding), 0.7, 0.3))
+
+
+def cut(surface: Surface) -> Generator[float, None, Charts]:
+    """Cut the faces of a mesh into charts.
 
     Seams follow where normals split; the triangles of a polygon stay together.
+
+    Yields:
+        Progress, 0 to 1.
+    Raises:
+        UserError: xatlas is not installed.
+    """
+    xatlas = _xatlas()
+    positions, triangles, corners = surface.positions, surface.triangles, surface.corners
+    normals, polygons = surface.corner_normals, surface.polygons
+    local = np.zeros((len(triangles), 3, 2))
+    pieces = _pieces(positions, triangles, polygons)
+    areas: list[float] = []
+    for number, piece in enumerate(pieces):
+        local[piece], found = _chart(xatlas, positions, triangles[piece], normals[corners[piece]])
+        areas += found
+        yield (number + 1) / len(pieces)
+    alone = _torn(local, positions, triangles, corners, polygons)
+    return Charts(local, positions, triangles, corners, polygons, len(normals), pieces, np.array(areas), alone)
+
+
+def lay_out(charts: Charts, *, side: int | None, texels_per_metre: float | None = None, padding: int = 2,
+            ) -> Generator[float, None, Atlas]:
+    """Place charts in a square texture, without overlaps.
 
     Args:
         side: texels a side, or None and texels_per_metre, which decides it.
@@ -55,37 +117,35 @@ def unwrap(surface: Surface, *, side: int | None, texels_per_metre: float | None
     Raises:
         UserError: xatlas is not installed, or the texture is too small for its charts.
     """
-    try:
-        import xatlas
-    except ImportError as error:
-        raise UserError("Textures need the Python package xatlas, which this Blender's Python has not; "
-                        "bake to vertices, or to a UV map of your own.") from error
-    positions, triangles, corners = surface.positions, surface.triangles, surface.corners
-    normals, polygons = surface.corner_normals, surface.polygons
-    local = np.zeros((len(triangles), 3, 2))  # metres, each piece in a plane of its own
-    pieces = _pieces(positions, triangles, polygons)
-    areas: list[float] = []  # of the charts, square metres
-    for number, piece in enumerate(pieces):
-        local[piece], found = _chart(xatlas, positions, triangles[piece], normals[corners[piece]])
-        areas += found
-        yield 0.7 * (number + 1) / len(pieces)
-    density = _density(np.array(areas), side, padding) if side else texels_per_metre or 1.0
-    alone = _torn(local, positions, triangles, corners, polygons)
-    uv = np.zeros((len(normals), 2))
+    xatlas = _xatlas()
+    density = _density(charts.areas, side, padding) if side else texels_per_metre or 1.0
+    triangles, polygons = charts.triangles, charts.polygons
+    local, alone = charts.local.copy(), charts.alone.copy()
+    uv = np.zeros((charts.corner_count, 2))
     for number in range(_REPAIRS):
-        groups = [kept for piece in pieces if len(kept := piece[~alone[piece]])]
+        groups = [kept for piece in charts.pieces if len(kept := piece[~alone[piece]])]
         if alone.any():
-            local[alone] = _laid_flat(positions[triangles[alone]], polygons[alone])
+            local[alone] = _laid_flat(charts.positions[triangles[alone]], polygons[alone])
             groups.append(np.flatnonzero(alone))
         packing = _pack(xatlas, local, groups, side, density, padding)
-        placed, found_side, charts, fits = yield from scaled(packing, 0.7 + 0.1 * number, 0.1)
-        uv[corners] = placed
+        placed, found_side, count, fits = yield from scaled(packing, number / _REPAIRS, 1 / _REPAIRS)
+        uv[charts.corners] = placed
         density *= fits  # the next try begins where this one ended
         pairs = Layout(placed, triangles, min(found_side, CHECKED_SIDE)).overlapping()
         if not len(pairs):
             break
         alone |= np.isin(polygons, polygons[pairs])  # of charts that lie over themselves
-    return Atlas(uv, found_side, charts, len(np.unique(polygons[alone])))
+    return Atlas(uv, found_side, density, count, len(np.unique(polygons[alone])))
+
+
+def _xatlas():
+    """The module. UserError where it is not installed."""
+    try:
+        import xatlas
+    except ImportError as error:
+        raise UserError("Textures need the Python package xatlas, which this Blender's Python has not; "
+                        "bake to vertices, or to a UV map of your own.") from error
+    return xatlas
 
 
 def _pieces(positions: NDArray, triangles: NDArray, polygons: NDArray) -> list[NDArray[np.int64]]:

@@ -10,13 +10,11 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ..backend.errors import UserError
-from ..backend.methods import METHODS
-from ..backend.record import BakeRecord
-from ..backend.texture import TextureTransfer
-from ..backend.transfer import Transfer
+from ..backend.methods import METHODS, run
 from ..scene.read import make_applied_copy, refusal
 from . import state
-from .job import Job, bake_object, finish, prepare, summary
+from .batch import Batch, Outcome, Result, finish_batch, prepare_batch
+from .job import summary
 
 _TICK = 0.05  # seconds between looks at the worker: Esc is answered within one
 
@@ -24,12 +22,12 @@ _TICK = 0.05  # seconds between looks at the worker: Esc is answered within one
 class Worker(threading.Thread):
     """Drives a bake over arrays alone; never touches bpy."""
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, batch: Batch) -> None:
         super().__init__(name="neural_gash_bake", daemon=True)
-        self._baking = job.baking
+        self._baking = batch.baking
         self._cancelled = threading.Event()
         self.progress = 0.0
-        self.transfer: Transfer | TextureTransfer | None = None
+        self.results: list[Result] | None = None
         self.error: Exception | None = None
 
     def run(self) -> None:
@@ -38,7 +36,7 @@ class Worker(threading.Thread):
             while not self._cancelled.is_set():
                 self.progress = next(self._baking)
         except StopIteration as end:
-            self.transfer = end.value
+            self.results = end.value
         except Exception as error:  # noqa: BLE001  handed to the main thread, which reports it
             self.error = error
         finally:
@@ -55,9 +53,9 @@ class _Baking:
     if TYPE_CHECKING:  # the operator's own
         def report(self, type: set[str], message: str) -> None: ...
 
-    def _begin(self, context: bpy.types.Context) -> bpy.types.Object:
-        """The object to bake. Raises UserError."""
-        return context.object
+    def _begin(self, context: bpy.types.Context) -> list[bpy.types.Object]:
+        """The objects to bake, the active one first. Raises UserError."""
+        return targets(context)
 
     def _undo(self, context: bpy.types.Context) -> None:
         """Take `_begin` back, as nothing came of it."""
@@ -65,18 +63,18 @@ class _Baking:
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Bake at once."""
         try:
-            return self._report(*bake_object(context, self._begin(context), context.scene.neural_gash))
+            batch = prepare_batch(context, self._begin(context), context.scene.neural_gash)
+            return self._report(finish_batch(context, batch, run(batch.baking)))
         except UserError as error:
             return self._fail(context, error)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         """Read the scene, and bake beside the window."""
         try:
-            obj = self._begin(context)
-            job = prepare(context, obj, context.scene.neural_gash, _tiles(obj))
+            batch = prepare_batch(context, self._begin(context), context.scene.neural_gash, _tiles)
         except UserError as error:
             return self._fail(context, error)
-        self._job, self._worker = job, Worker(job)
+        self._batch, self._worker = batch, Worker(batch)
         self._timer = context.window_manager.event_timer_add(_TICK, window=context.window)
         context.window_manager.modal_handler_add(self)
         context.window_manager.progress_begin(0, 100)
@@ -96,15 +94,16 @@ class _Baking:
             state.progress = self._worker.progress
             context.window_manager.progress_update(100 * state.progress)
             if context.workspace:
+                names = ", ".join(job.name for job in self._batch.jobs)
                 context.workspace.status_text_set(
-                    f"Baking {self._job.name}: {100 * state.progress:.0f} %   (Esc cancels)")
+                    f"Baking {names}: {100 * state.progress:.0f} %   (Esc cancels)")
             state.redraw(context)
             return {"RUNNING_MODAL"}
         self._end(context)
-        if self._worker.transfer is None:
+        if self._worker.results is None:
             return self._fail(context, self._worker.error or UserError("The bake was stopped."))
         try:
-            return self._report(*finish(context, self._job, self._worker.transfer))
+            return self._report(finish_batch(context, self._batch, self._worker.results))
         except UserError as error:
             return self._fail(context, error)
 
@@ -130,18 +129,30 @@ class _Baking:
         self.report({"ERROR"}, str(error) if isinstance(error, UserError) else f"The bake failed: {error!r}.")
         return {"CANCELLED"}
 
-    def _report(self, record: BakeRecord, warning: str) -> set[str]:
-        """Say how the bake went, in one line."""
-        self.report({"INFO"}, f"{summary(record)}.")
-        if warning:
-            self.report({"WARNING"}, warning)
+    def _report(self, outcomes: list[Outcome]) -> set[str]:
+        """Say how the bake of each object went, in one line."""
+        several = len(outcomes) > 1
+        for outcome in outcomes:
+            if outcome.record is not None:
+                self.report({"INFO"}, f"{outcome.name}: {summary(outcome.record)}." if several else
+                            f"{summary(outcome.record)}.")
+            if outcome.sentence:
+                self.report({"WARNING"}, outcome.sentence)
         return {"FINISHED"}
 
 
-def _tiles(obj: bpy.types.Object | None) -> Path | None:
+def targets(context: bpy.types.Context) -> list[bpy.types.Object]:
+    """What Bake bakes: the active object, and with it the other selected meshes if it is selected."""
+    active = context.object
+    if active is None or not active.select_get():
+        return [active]
+    return [active, *(o for o in context.selected_objects if o != active and o.type == "MESH")]
+
+
+def _tiles(obj: bpy.types.Object) -> Path | None:
     """Where an extension may keep the tiles of a texture that is being baked; None where this is none."""
     package = __package__.rpartition(".")[0]
-    if obj is None or not package.startswith("bl_ext."):
+    if not package.startswith("bl_ext."):
         return None
     name = hashlib.blake2b(f"{bpy.data.filepath}|{obj.name}".encode(), digest_size=8).hexdigest()
     return Path(bpy.utils.extension_path_user(package, path="tiles", create=True)) / name
@@ -158,7 +169,7 @@ def _bake_refusal(context: bpy.types.Context) -> str:
 
 
 class NEURAL_GASH_OT_bake(_Baking, bpy.types.Operator):
-    """Bake how light reaches every point of the active mesh, and show it lit by the World"""
+    """Bake how light reaches every point of the active mesh and other selected ones, and show it lit by the World"""
 
     bl_idname = "neural_gash.bake"
     bl_label = "Bake"
@@ -192,14 +203,14 @@ class NEURAL_GASH_OT_bake_applied_copy(_Baking, bpy.types.Operator):
             cls.poll_message_set(reason)
         return not reason
 
-    def _begin(self, context: bpy.types.Context) -> bpy.types.Object:
+    def _begin(self, context: bpy.types.Context) -> list[bpy.types.Object]:
         """The copy, selected and active in the original's place."""
         self._original = context.object.session_uid
         self._selected = {obj.session_uid for obj in context.selected_objects}
         copy = make_applied_copy(context.object, context.evaluated_depsgraph_get())
         self._copy = copy.session_uid
         self._select(context, {copy.session_uid}, copy.session_uid)
-        return copy
+        return [copy]
 
     def _undo(self, context: bpy.types.Context) -> None:
         """Remove the copy and select what was selected."""

@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import bpy
@@ -13,14 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend import methods
+from ..backend.atlas import Part
 from ..backend.bounce import Reflection
 from ..backend.errors import UserError
+from ..backend.geometry import Surface
 from ..backend.record import VERSION, BakeRecord
+from ..backend.resolution import fitting_side
 from ..backend.texels import NormalMap
 from ..backend.texture import TextureTransfer, remove_tiles
 from ..backend.texture import bake as bake_texture
 from ..backend.transfer import Transfer
-from ..properties import COLLECTION, DENSITY, RAYS, TEXTURE, NeuralGashSettings
+from ..properties import COLLECTION, DENSITY, FIT, RAYS, TEXTURE, NeuralGashSettings
 from ..scene.attributes import attribute_count, read_record, write_textures, write_transfer
 from ..scene.lighting import apply_light, take_light
 from ..scene.normal_maps import read_normal_maps
@@ -30,6 +34,8 @@ from ..scene.read import (
     VISIBLE,
     SceneMesh,
     fingerprint,
+    group_mode,
+    is_group,
     read_albedo,
     read_object,
     read_occluders,
@@ -43,6 +49,7 @@ from ..scene.uv_maps import check_room, read_uv
 class TextureOptions:
     """How a texture bake is kept."""
 
+    part: Part           # what gets room in the texture
     own_uv: bool         # the bake makes its UV map
     uv_map: str          # of the person's, else ''
     folder: Path | None  # None: packed
@@ -57,7 +64,7 @@ class Job:
     uid: int               # of the object; its name may change meanwhile
     name: str
     read: SceneMesh
-    baking: Generator[float, None, Transfer | TextureTransfer]
+    bake: Callable[..., Generator[float, None, Transfer | TextureTransfer]]  # a texture's takes uv= and side=
     occluders: str
     fingerprint: str
     frame: tuple[float, ...]
@@ -66,11 +73,12 @@ class Job:
 
 
 def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: NeuralGashSettings,
-            tiles: Path | None = None) -> Job:
+            tiles: Path | None = None, group: Sequence[bpy.types.Object] = ()) -> Job:
     """Read the object and what blocks its light.
 
     Args:
         tiles: a folder for the finished tiles of a texture, from which a bake that was killed goes on.
+        group: the objects that are baked together with it.
     Raises:
         UserError: that cannot be baked.
     """
@@ -79,49 +87,64 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
     depsgraph = context.evaluated_depsgraph_get()
     read = read_object(obj, depsgraph)
     method = methods.METHODS[settings.method]
-    mode = settings.occluder_mode() if method.traces else SELF
-    if not mode:
-        raise UserError("Choose the collection whose objects cast shadows.")
-    if method.traces and settings.occluders == COLLECTION and mode in (SELF, VISIBLE):
-        raise UserError(f"A collection named '{mode}' cannot cast shadows, as the name has another meaning; "
-                        "rename it.")
-    occluders = read_occluders(obj, mode, depsgraph)
-    by_rays = settings.quality == RAYS
-    rays = settings.rays if method.traces and by_rays else None
-    tolerance = settings.tolerance if method.traces and not by_rays else None
+    mode = _occluder_mode(obj, settings, group) if method.traces else SELF
+    quality = {}
+    if method.traces:
+        by_rays = settings.quality == RAYS
+        quality = {"rays": settings.rays} if by_rays else {"tolerance": settings.tolerance}
     reflection = None
     if method.traces and settings.bounces:
         if settings.target != TEXTURE and attribute_count(3 * settings.order ** 2) > EEVEE_ATTRIBUTES:
             raise UserError(f"With bounces, an order-{settings.order} bake takes more than the {EEVEE_ATTRIBUTES} "
                             "attributes that EEVEE draws; choose order 4 or less, or bake to a texture.")
         reflection = Reflection(read_albedo(obj, mode, depsgraph), settings.bounces)
+    occluders = read_occluders(obj, mode, depsgraph)
+    bake: Callable[..., Generator[float, None, Transfer | TextureTransfer]]
     texture = None
-    uv = None
-    baking: Generator[float, None, Transfer | TextureTransfer]
     if settings.target == TEXTURE:
-        if settings.uv_map:
-            uv = read_uv(obj.data, settings.uv_map)
-        folder = Path(bpy.path.abspath(settings.texture_folder)) if settings.texture_folder else None
-        if folder is not None and not folder.is_absolute():
-            raise UserError("The folder of the textures is beside a .blend file that has not been saved yet; "
-                            "save it first, or leave the folder empty.")
-        if uv is None:
-            check_room(obj.data)
-        texture = TextureOptions(uv is None, settings.uv_map, folder, settings.half, tiles)
-        dense = settings.sizing == DENSITY and uv is None
         maps = read_normal_maps(obj, depsgraph, read.surface, read.matrix)
-        before = fingerprint(obj, depsgraph, mode, uv, reflection is not None)
-        baking = bake_texture(
-            read.surface, settings.method, settings.order, uv=uv, side=None if dense else settings.side,
-            texels_per_metre=settings.texels_per_metre if dense else None, padding=settings.padding, rays=rays,
-            tolerance=tolerance, occluders=occluders, normal_maps=maps, folder=tiles,
-            key=_key(settings, before, read.matrix, maps), reflection=reflection)
+        what = {"method": settings.method, "order": settings.order, "occluders": occluders, "normal_maps": maps}
+        texture = _texture_options(obj, settings, read.surface, tiles, what)
+        before = fingerprint(obj, depsgraph, mode, texture.part.uv, reflection is not None)
+        bake = partial(bake_texture, read.surface, **what, **quality, folder=tiles, reflection=reflection,
+                       key=_key(settings, before, read.matrix, maps))
     else:
         before = fingerprint(obj, depsgraph, mode, bounces=reflection is not None)
-        baking = methods.bake(read.mesh, settings.method, settings.order, rays=rays, tolerance=tolerance,
-                              occluders=occluders, reflection=reflection)
-    return Job(obj.session_uid, obj.name, read, baking, mode, before, read.frame, texture,
-               reflection is not None)
+        bake = partial(methods.bake, read.mesh, settings.method, settings.order, **quality, occluders=occluders,
+                       reflection=reflection)
+    return Job(obj.session_uid, obj.name, read, bake, mode, before, read.frame, texture, reflection is not None)
+
+
+def _occluder_mode(obj: bpy.types.Object, settings: NeuralGashSettings, group: Sequence[bpy.types.Object]) -> str:
+    """What shadows the object. Raises UserError where that is not clear."""
+    mode = settings.occluder_mode()
+    if not mode:
+        raise UserError("Choose the collection whose objects cast shadows.")
+    if settings.occluders == COLLECTION and (mode in (SELF, VISIBLE) or is_group(mode)):
+        raise UserError(f"A collection named '{mode}' cannot cast shadows, as the name has another meaning; "
+                        "rename it.")
+    return group_mode(group or [obj]) if mode == SELF else mode
+
+
+def _texture_options(obj: bpy.types.Object, settings: NeuralGashSettings, surface: Surface, tiles: Path | None,
+                     what: dict) -> TextureOptions:
+    """How the texture of an object is laid out and kept; what: the arguments of its trials."""
+    uv = read_uv(obj.data, settings.uv_map) if settings.uv_map else None
+    folder = Path(bpy.path.abspath(settings.texture_folder)) if settings.texture_folder else None
+    if folder is not None and not folder.is_absolute():
+        raise UserError("The folder of the textures is beside a .blend file that has not been saved yet; "
+                        "save it first, or leave the folder empty.")
+    if uv is None:
+        check_room(obj.data)
+    trial = partial(fitting_side, surface, error=settings.tolerance, **what) if settings.sizing == FIT else None
+    return TextureOptions(Part(surface, uv, trial, obj.name), uv is None, settings.uv_map, folder, settings.half, tiles)
+
+
+def size(settings: NeuralGashSettings) -> dict:
+    """The arguments of `atlas.place` that say how large a texture is."""
+    dense = settings.sizing == DENSITY and not settings.uv_map  # a UV map that is there has no metres
+    return {"side": None if dense or settings.sizing == FIT else settings.side,
+            "texels_per_metre": settings.texels_per_metre if dense else None, "padding": settings.padding}
 
 
 def _key(settings: NeuralGashSettings, shape: str, matrix: NDArray, maps: Sequence[NormalMap]) -> str:
@@ -131,28 +154,39 @@ def _key(settings: NeuralGashSettings, shape: str, matrix: NDArray, maps: Sequen
         digest.update(normal_map.image.tobytes() + normal_map.uv.tobytes() + str(normal_map.strength).encode())
     chosen = {name: getattr(settings, name) for name in
               ("method", "order", "quality", "rays", "tolerance", "sizing", "side", "texels_per_metre", "padding",
-               "bounces")}
+               "bounces", "share")}
     return json.dumps({"version": VERSION, "shape": shape, "place": digest.hexdigest(), **chosen}, sort_keys=True)
 
 
-def finish(context: bpy.types.Context, job: Job, transfer: Transfer | TextureTransfer) -> tuple[BakeRecord, str]:
+def check(context: bpy.types.Context, job: Job) -> bpy.types.Object:
+    """The object of a job. Raises UserError where it is gone, or has changed since it was read."""
+    obj = next((o for o in bpy.data.objects if o.session_uid == job.uid), None)
+    if obj is None:
+        raise UserError(f"'{job.name}' was deleted while it was being baked.")
+    uv_map = job.texture.uv_map if job.texture else ""
+    now = fingerprint(obj, context.evaluated_depsgraph_get(), job.occluders,
+                      read_uv(obj.data, uv_map) if uv_map else None, job.bounces)
+    if not same_fingerprint(now, job.fingerprint):
+        raise UserError(f"'{obj.name}' or what shadows it was changed during the bake; bake again.")
+    return obj
+
+
+def finish(context: bpy.types.Context, job: Job, transfer: Transfer | TextureTransfer,
+           images: Sequence[bpy.types.Image] = ()) -> tuple[BakeRecord, str]:
     """Write the bake, light it from the World and show it.
 
+    Args:
+        images: of a texture that the object shares; its own are made where not given.
     Returns:
         The record, and a sentence to warn with ('' where all is well).
     Raises:
         UserError: the object is gone or has changed meanwhile, holds attributes in the way, or files
             cannot be written.
     """
-    obj = next((o for o in bpy.data.objects if o.session_uid == job.uid), None)
-    if obj is None:
-        raise UserError(f"'{job.name}' was deleted while it was being baked.")
+    obj = check(context, job)
     depsgraph = context.evaluated_depsgraph_get()
     uv_map = job.texture.uv_map if job.texture else ""
-    now = fingerprint(obj, depsgraph, job.occluders, read_uv(obj.data, uv_map) if uv_map else None,
-                      job.bounces)
-    if not same_fingerprint(now, job.fingerprint):
-        raise UserError(f"'{obj.name}' or what shadows it was changed during the bake; bake again.")
+    now = job.fingerprint
     if job.bounces and transfer.record.colours == 1:  # nothing bounced: no colour counts
         now = fingerprint(obj, depsgraph, job.occluders, read_uv(obj.data, uv_map) if uv_map else None)
     record = replace(transfer.record, occluders=job.occluders, fingerprint=now, frame=job.frame, uv_map=uv_map)
@@ -162,7 +196,7 @@ def finish(context: bpy.types.Context, job: Job, transfer: Transfer | TextureTra
             now = fingerprint(obj, depsgraph, job.occluders, transfer.uv.astype(np.float32), record.colours == 3)
             record = replace(record, fingerprint=now)
         write_textures(obj, replace(transfer, record=record), own_uv=job.texture.own_uv, folder=job.texture.folder,
-                       half=job.texture.half)
+                       half=job.texture.half, images=images)
         if job.texture.tiles is not None:
             remove_tiles(job.texture.tiles)
     else:
@@ -180,13 +214,6 @@ def finish(context: bpy.types.Context, job: Job, transfer: Transfer | TextureTra
         warning = str(error)
     apply_light(context.scene)  # every preview: the World's light may be another now, and twins share the bake
     return record, warning
-
-
-def bake_object(context: bpy.types.Context, obj: bpy.types.Object | None, settings: NeuralGashSettings,
-                progress: Callable[[float], None] | None = None) -> tuple[BakeRecord, str]:
-    """The whole bake at once; see `prepare` and `finish`."""
-    job = prepare(context, obj, settings)
-    return finish(context, job, methods.run(job.baking, progress))
 
 
 def summary(record: BakeRecord) -> str:

@@ -11,7 +11,7 @@ from ..backend.methods import METHODS
 from ..backend.record import BakeRecord
 from ..ops import state
 from ..ops.job import percent
-from ..properties import COLLECTION, DENSITY, RAYS, TEXTURE, NeuralGashSettings
+from ..properties import COLLECTION, DENSITY, FIT, RAYS, TEXTURE, NeuralGashSettings
 from ..scene import staleness
 from ..scene.attributes import RECORD, has_bake
 from ..scene.preview import is_on
@@ -131,12 +131,15 @@ class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):
         """What a texture has beside."""
         if obj is not None and obj.type == "MESH":
             layout.prop_search(settings, "uv_map", obj.data, "uv_layers")
-        if not settings.uv_map:
-            layout.prop(settings, "sizing", expand=True)
-        by_density = settings.sizing == DENSITY and not settings.uv_map
-        layout.prop(settings, "texels_per_metre" if by_density else "side")
+        layout.prop(settings, "sizing", expand=True)
+        if settings.sizing == FIT:
+            if settings.quality == RAYS or not METHODS[settings.method].traces:
+                layout.prop(settings, "tolerance")
+        else:
+            layout.prop(settings, "texels_per_metre" if settings.sizing == DENSITY and not settings.uv_map else "side")
         if not settings.uv_map:
             layout.prop(settings, "padding")
+        layout.prop(settings, "share")
         layout.prop(settings, "half")
         layout.prop(settings, "texture_folder")
 

@@ -9,6 +9,7 @@ ones are K times red, green and blue.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -79,13 +80,13 @@ def write_transfer(obj: bpy.types.Object, mesh: TriangleMesh, transfer: Transfer
     data.update_tag()
 
 
-def write_textures(obj: bpy.types.Object, transfer: TextureTransfer, *, own_uv: bool, folder: Path | None, half: bool
-                   ) -> None:
+def write_textures(obj: bpy.types.Object, transfer: TextureTransfer, *, own_uv: bool, folder: Path | None, half: bool,
+                   images: Sequence[bpy.types.Image] = ()) -> None:
     """Store a texture bake on the object's mesh in place of any earlier bake.
 
     Args:
         own_uv: the UVs are an atlas of the bake's own, which becomes a UV map of the mesh.
-        folder, half: see `images.make_images`.
+        folder, half: see `images.make_images`. images: of a texture that is shared, instead.
     Raises:
         UserError: as `write_transfer`, or the files or the UV map cannot be made; nothing has changed then.
     """
@@ -95,7 +96,7 @@ def write_textures(obj: bpy.types.Object, transfer: TextureTransfer, *, own_uv: 
         raise UserError(f"'{obj.name}' was changed while it was being baked; bake again.")
     if own_uv:
         check_room(data)
-    images = make_images(obj.name, transfer, folder, half)
+    images = images or make_images(obj.name, transfer, folder, half)
     discard(data)
     uv_map = write_own_uv(data, transfer.uv) if own_uv else transfer.record.uv_map
     attach(data, images)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -20,26 +20,28 @@ _IMAGES = "neural_gash_images"  # custom property of the mesh: its transfer imag
 RECORD = "neural_gash"         # custom property of an image: the record of the bake it belongs to
 
 
-def make_images(name: str, transfer: TextureTransfer, folder: Path | None, half: bool) -> list[bpy.types.Image]:
+def make_images(name: str, transfer: TextureTransfer, folder: Path | None, half: bool, parts: str = ""
+                ) -> list[bpy.types.Image]:
     """New images that hold a texture bake, four coefficients each.
 
     Args:
         folder: where the files go; they are packed into the .blend where not given.
         half: 16 bits a channel instead of 32.
+        parts: what the record does not say of each object that shares the texture, as JSON.
     Raises:
         UserError: files cannot be written there, or others' are in the way.
     """
     if folder is not None:
-        return _load(name, _write(name, transfer, folder, half), transfer.record, half)
+        return _load(name, _write(name, transfer, folder, half, parts), transfer.record, half)
     with tempfile.TemporaryDirectory(prefix="neural_gash-") as temporary:
-        images = _load(name, _write(name, transfer, Path(temporary), half), transfer.record, half)
+        images = _load(name, _write(name, transfer, Path(temporary), half, parts), transfer.record, half)
         for image in images:
             image.pack()
             image.filepath_raw = f"//{Path(image.filepath_raw).name}"  # the file itself is going
         return images
 
 
-def attach(data: bpy.types.Mesh, images: list[bpy.types.Image]) -> None:
+def attach(data: bpy.types.Mesh, images: Sequence[bpy.types.Image]) -> None:
     """Make the images those of the mesh."""
     data[_IMAGES] = {str(number): image for number, image in enumerate(images)}
 
@@ -90,7 +92,7 @@ def _attached(data: bpy.types.Mesh) -> list[bpy.types.Image | None]:
             for key in sorted(stored.keys(), key=int)]
 
 
-def _write(name: str, transfer: TextureTransfer, folder: Path, half: bool) -> list[Path]:
+def _write(name: str, transfer: TextureTransfer, folder: Path, half: bool, parts: str) -> list[Path]:
     """Write the files, each in one step, and the record beside them."""
     clean = re.sub(r"[^\w.-]+", "_", name) or "mesh"
     paths = [folder / f"{clean}_prt_{number}.exr" for number in range(image_count(transfer.record.terms))]
@@ -110,7 +112,7 @@ def _write(name: str, transfer: TextureTransfer, folder: Path, half: bool) -> li
         for number, path in enumerate(paths):
             exr.write(path, transfer.image(number, filled).reshape(side, side, 4), text, half)
         with atomic(folder / f"{clean}_prt.json") as draft:
-            draft.write_text(text + "\n")
+            draft.write_text((f'{text[:-1]}, "objects": {parts}}}' if parts else text) + "\n")
     except OSError as error:
         raise UserError(f"The textures cannot be written to '{folder}' ({reason(error)}).") from error
     return paths

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+import json
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -25,8 +26,8 @@ SELF, VISIBLE = "SELF", "VISIBLE"
 _SAME = 1e-4
 _FARTHEST = 1e18  # metres; beyond, squares of coordinates leave float32
 
-__all__ = ["SELF", "VISIBLE", "SceneMesh", "bake_frame", "fingerprint", "make_applied_copy", "read_object",
-           "read_occluders", "refusal", "same_fingerprint"]
+__all__ = ["SELF", "VISIBLE", "SceneMesh", "bake_frame", "fingerprint", "group_mode", "is_group", "make_applied_copy",
+           "read_object", "read_occluders", "refusal", "same_fingerprint"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,17 +136,41 @@ def make_applied_copy(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> 
     return new
 
 
+def group_mode(objects: Sequence[bpy.types.Object]) -> str:
+    """The occluder mode of objects that are baked together: each is shadowed by itself and the others."""
+    return SELF if len(objects) == 1 else json.dumps(sorted(obj.name for obj in objects))
+
+
+def is_group(mode: str) -> bool:
+    """Whether an occluder mode is a `group_mode` of several objects."""
+    return mode.startswith("[")
+
+
+def _members(mode: str) -> list[bpy.types.Object]:
+    """The objects that a mode names: of a group, or of a collection. UserError where one is gone."""
+    if is_group(mode):
+        names = json.loads(mode)
+        lost = [name for name in names if name not in bpy.data.objects]
+        if lost:
+            raise UserError(f"There is no object named '{lost[0]}' any more to cast its shadow.")
+        return [bpy.data.objects[name] for name in names]
+    collection = bpy.data.collections.get(mode)
+    if collection is None:
+        raise UserError(f"There is no collection named '{mode}' to take occluders from.")
+    return list(collection.all_objects)
+
+
 def read_occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph,
                    ) -> list[tuple[Array, NDArray[np.int32]]]:
     """What blocks the light of `obj` besides itself, in world axes.
 
     Args:
         mode: 'SELF' (nothing), 'VISIBLE' (what the viewport shows and a render would), or a
-            collection's name (all its objects, hidden ones too).
+            collection's name or a `group_mode` (all their objects, hidden ones too).
     Returns:
         One (positions (V, 3) float64, triangles (F, 3) int32) per object and instance.
     Raises:
-        UserError: there is no such collection.
+        UserError: there is no such collection or object.
     """
     return [(_transform(local, matrix), _outward(triangles, matrix))
             for local, triangles, _, matrix in _occluders(obj, mode, depsgraph)]
@@ -242,12 +267,9 @@ def _occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph,
     if mode == VISIBLE:
         yield from _instances(depsgraph, None, obj, coloured)
         return
-    collection = bpy.data.collections.get(mode)
-    if collection is None:
-        raise UserError(f"There is no collection named '{mode}' to take occluders from.")
-    members = [o for o in collection.all_objects if o != obj]
-    hidden = [o for o in members if not o.visible_get(view_layer=depsgraph.view_layer)]
-    owners = {o.session_uid for o in collection.all_objects} - {o.session_uid for o in hidden}
+    members = _members(mode)
+    hidden = [o for o in members if o != obj and not o.visible_get(view_layer=depsgraph.view_layer)]
+    owners = {o.session_uid for o in members} - {o.session_uid for o in hidden}
     yield from _instances(depsgraph, owners, obj, coloured)
     if hidden:
         with revealed(hidden, depsgraph) as (own_depsgraph, _):

@@ -188,7 +188,8 @@ def test_one_undo_step(make, settings):
 
 
 def test_report_is_one_line(make, settings):
-    from neural_gash_addon.ops.job import bake_object, percent, summary
+    from neural_gash_addon.ops.batch import bake_object
+    from neural_gash_addon.ops.job import percent, summary
     record, warning = bake_object(bpy.context, make(*WEDGE), settings)
     assert not warning
     line = summary(record)
@@ -197,7 +198,7 @@ def test_report_is_one_line(make, settings):
 
 
 def test_progress_rises_to_one(make, settings):
-    from neural_gash_addon.ops.job import bake_object
+    from neural_gash_addon.ops.batch import bake_object
     seen = []
     bake_object(bpy.context, make(*CUBE), settings, seen.append)
     assert seen and seen == sorted(seen) and seen[0] >= 0 and seen[-1] <= 1

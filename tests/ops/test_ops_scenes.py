@@ -47,7 +47,7 @@ def test_size_changes_nothing(make, settings, scale):
 
 def test_material_that_reads_many_attributes(make, settings):
     """Ten of its own and seven of order 5 are more than EEVEE draws: the bake is kept, the material too."""
-    from neural_gash_addon.ops.job import bake_object
+    from neural_gash_addon.ops.batch import bake_object
     from neural_gash_addon.scene.attributes import has_bake
     from neural_gash_addon.scene.preview import is_on
     obj = make()
