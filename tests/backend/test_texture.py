@@ -272,3 +272,23 @@ def test_own_atlas_equals_the_one_made_before():
     assert 20 < sized.record.side < 200
     with pytest.raises(UserError, match="resolution"):
         methods.run(texture.bake(mesh, rays=4))
+
+
+@pytest.mark.parametrize("tolerance", [0.1, 0.03])
+def test_a_fitted_texture_has_the_error_asked_for(tolerance):
+    from neural_gash_addon.backend import resolution
+    from neural_gash_addon.backend.raster import Coverage
+    mesh = surface(shapes.torus())
+    uv = atlas(mesh, 512).uv
+    side = methods.run(resolution.fitting_side(mesh, uv, error=tolerance, order=3))
+    errors = []
+    for size in (side, side // 2):
+        result = methods.run(texture.bake(mesh, "embree", 3, uv=uv, side=max(size, 16), rays=1024))
+        rng = np.random.default_rng(4)
+        faces = rng.integers(0, len(mesh.triangles), 1000)
+        weights = rng.dirichlet([1, 1, 1], 1000)
+        points = texel_points(mesh, Coverage(1, np.arange(1000), faces, weights, weights))
+        exact = methods.run(methods.bake(points, "embree", 3, rays=4096, seed=3)).coefficients
+        found = lookup(result, np.einsum("nc,ncx->nx", weights, uv[mesh.corners[faces]]))
+        errors.append(metrics.rel_l2(found, exact))
+    assert errors[0] < 1.5 * tolerance < 6 * errors[1], (side, errors)
