@@ -81,9 +81,11 @@ class Bounces:
         self.added: list[float] = []  # transfer of constant light that each bounce added, of all of it
         self._scene, self._order, self._seed = scene, order, seed
         self._threads = threads or default_threads()
-        self._met = np.zeros((0, PATCH_RAYS), np.int32)   # (sides, rays) which traced side, -1: none
+        self.sides = np.zeros(0, np.int64)               # traced sides: 2 * patch, plus 1 for its back
+        self.met = np.zeros((0, PATCH_RAYS), np.int32)   # (sides, rays) which traced side, -1: none
+        self.directions = np.zeros((0, PATCH_RAYS, 3), np.float32)  # (sides, rays, 3)
         self._row = np.full(2 * self.patches.count, -1)   # row of each side that was traced
-        self._direct = np.zeros((0, order * order))
+        self.direct = np.zeros((0, order * order))
         self._leaving = np.zeros((0, 3 * order * order), np.float32)  # albedo times the sum of bounces
 
     @property
@@ -99,10 +101,9 @@ class Bounces:
         """
         if bounces == 0 or not self.albedo.any():
             return
-        yield from self._trace()
-        reflectance = np.repeat(self.albedo, 2, axis=0)[np.flatnonzero(self._row >= 0)[np.argsort(
-            self._row[self._row >= 0])]]                                  # (sides, 3)
-        now = np.repeat(self._direct[:, :, None], 3, axis=2)              # (sides, K, 3)
+        yield from self.trace()
+        reflectance = self.albedo[self.sides // 2]                        # (sides, 3)
+        now = np.repeat(self.direct[:, :, None], 3, axis=2)              # (sides, K, 3)
         total = np.zeros_like(now)
         areas = self._areas()
         whole = float(areas @ now[:, 0].mean(1))
@@ -125,11 +126,11 @@ class Bounces:
         step = max(1, _RAYS_AT_ONCE // PATCH_RAYS)
 
         def part(start: int) -> None:
-            met = self._met[start:start + step]
+            met = self.met[start:start + step]
             out[start:start + step] = padded[met.ravel()].reshape(*met.shape, -1).mean(1, dtype=np.float64)
 
         with ThreadPoolExecutor(self._threads) as pool:
-            list(pool.map(part, range(0, len(self._met), step)))
+            list(pool.map(part, range(0, len(self.met), step)))
         return out
 
     def gather(self, mesh: TriangleMesh, rays: int) -> Generator[float, None, NDArray[np.float32]]:
@@ -151,40 +152,42 @@ class Bounces:
 
         def part(points: NDArray) -> None:
             frames = sampling.frames(mesh.normals[points], angles[points])
-            directions = np.einsum("nij,nrj->nri", frames, sets[which[points]]).astype(np.float32).reshape(-1, 3)
-            origins = self._scene.origins(mesh.points[points], mesh.clearance[points]).repeat(rays, axis=0)
-            met = self._met_by(origins, directions).reshape(-1, rays)
+            directions = np.einsum("nij,nrj->nri", frames, sets[which[points]]).astype(np.float32)
+            met = self.met_by(mesh, points, directions)
             out[points] = padded[met.ravel()].reshape(len(points), rays, -1).mean(1).reshape(-1, terms, 3)
 
-        yield from _spread(part, [lit[s:s + step] for s in range(0, len(lit), step)], self._threads)
+        yield from spread(part, [lit[s:s + step] for s in range(0, len(lit), step)], self._threads)
         return out
 
-    def _trace(self) -> Generator[float, None, None]:
+    def trace(self) -> Generator[float, None, None]:
         """Trace all fronts, and then the backs that were met, until no new ones are."""
         fresh = 2 * np.arange(self.patches.count)
         while len(fresh):
-            self._row[fresh] = len(self._direct) + np.arange(len(fresh))
+            self._row[fresh] = len(self.direct) + np.arange(len(fresh))
             sides = np.full((len(fresh), PATCH_RAYS), -1, np.int64)
             direct = np.zeros((len(fresh), self._order ** 2))
+            ways = np.zeros((len(fresh), PATCH_RAYS, 3), np.float32)
             step = max(1, _RAYS_AT_ONCE // PATCH_RAYS)
             parts = [np.arange(s, min(s + step, len(fresh))) for s in range(0, len(fresh), step)]
-            seeds = np.random.SeedSequence([self._seed, 2, len(self._direct)]).spawn(len(parts))
+            seeds = np.random.SeedSequence([self._seed, 2, len(self.direct)]).spawn(len(parts))
 
             def part(job: tuple[NDArray, np.random.SeedSequence], fresh: NDArray = fresh, sides: NDArray = sides,
-                     direct: NDArray = direct) -> None:
+                     direct: NDArray = direct, ways: NDArray = ways) -> None:
                 rows, seed = job
-                sides[rows], direct[rows] = self._traced(fresh[rows], np.random.default_rng(seed))
+                sides[rows], direct[rows], ways[rows] = self._traced(fresh[rows], np.random.default_rng(seed))
 
-            for share in _spread(part, list(zip(parts, seeds, strict=True)), self._threads):
+            for share in spread(part, list(zip(parts, seeds, strict=True)), self._threads):
                 yield 0.5 * share
-            self._met = np.concatenate([self._met, sides.astype(np.int32)])
-            self._direct = np.concatenate([self._direct, direct])
+            self.met = np.concatenate([self.met, sides.astype(np.int32)])
+            self.direct = np.concatenate([self.direct, direct])
+            self.directions = np.concatenate([self.directions, ways])
+            self.sides = np.concatenate([self.sides, fresh])
             found = np.unique(sides[sides >= 0])
             fresh = found[self._row[found] < 0]
-        self._met = np.where(self._met >= 0, self._row[self._met], -1).astype(np.int32)
+        self.met = np.where(self.met >= 0, self._row[self.met], -1).astype(np.int32)
 
-    def _traced(self, sides: NDArray, rng: np.random.Generator) -> tuple[NDArray, NDArray]:
-        """Sides that the rays of some sides (n,) meet (n, rays), and their direct transfer (n, K)."""
+    def _traced(self, sides: NDArray, rng: np.random.Generator) -> tuple[NDArray, NDArray, NDArray]:
+        """Sides that the rays of some sides (n,) meet (n, rays), their direct transfer (n, K), and the rays."""
         points, normals, inwards = self.patches.sample(sides, PATCH_RAYS, rng)
         local = sampling.hemisphere_sets(1, PATCH_RAYS, int(rng.integers(2**31)))[0]
         flat = normals.reshape(-1, 3)
@@ -199,24 +202,25 @@ class Bounces:
         met = np.full(len(rays), -1, np.int64)
         met[hits.rays] = self.patches.of_hits(hits)
         seen = sh.evaluate(directions, self._order) * (met < 0)[:, None]
-        return met.reshape(len(sides), -1), seen.reshape(len(sides), PATCH_RAYS, -1).mean(1)
+        shape = len(sides), PATCH_RAYS, -1
+        return met.reshape(len(sides), -1), seen.reshape(shape).mean(1), rays.reshape(shape)
 
-    def _met_by(self, origins: NDArray, directions: NDArray) -> NDArray[np.int64]:
-        """(R,) row of the traced side that each ray meets, -1 where it meets none."""
-        hits = self._scene.hits(origins, directions)
-        met = np.full(len(directions), -1, np.int64)
+    def met_by(self, mesh: TriangleMesh, points: NDArray[np.int64], directions: NDArray[np.float32]
+               ) -> NDArray[np.int32]:
+        """(n, R) row of the traced side that rays (n, R, 3) from some points (n,) meet, -1 where they meet none."""
+        count, rays = directions.shape[:2]
+        origins = self._scene.origins(mesh.points[points], mesh.clearance[points]).repeat(rays, axis=0)
+        hits = self._scene.hits(origins, directions.reshape(-1, 3))
+        met = np.full(count * rays, -1, np.int32)
         met[hits.rays] = self._row[self.patches.of_hits(hits)]
-        return met
+        return met.reshape(count, rays)
 
     def _areas(self) -> NDArray[np.float64]:
         """(sides,) area of each traced side."""
-        out = np.zeros(len(self._direct))
-        traced = np.flatnonzero(self._row >= 0)
-        out[self._row[traced]] = self.patches.patch_areas[traced // 2]
-        return out
+        return self.patches.patch_areas[self.sides // 2]
 
 
-def _spread(work: Callable, jobs: list, threads: int) -> Generator[float, None, None]:
+def spread(work: Callable, jobs: list, threads: int) -> Generator[float, None, None]:
     """Do the jobs on some threads, a few at a time, yielding the share that is done."""
     stop = threading.Event()
 

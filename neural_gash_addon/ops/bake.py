@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ from ..backend.errors import UserError
 from ..backend.methods import METHODS, run
 from ..scene.read import make_applied_copy, refusal
 from . import state
-from .batch import Batch, Outcome, Result, finish_batch, prepare_batch
+from .batch import Outcome, finish_batch, prepare_batch
 from .job import summary
 
 _TICK = 0.05  # seconds between looks at the worker: Esc is answered within one
@@ -22,12 +23,12 @@ _TICK = 0.05  # seconds between looks at the worker: Esc is answered within one
 class Worker(threading.Thread):
     """Drives a bake over arrays alone; never touches bpy."""
 
-    def __init__(self, batch: Batch) -> None:
+    def __init__(self, baking: Generator[float, None, object]) -> None:
         super().__init__(name="neural_gash_bake", daemon=True)
-        self._baking = batch.baking
+        self._baking = baking
         self._cancelled = threading.Event()
         self.progress = 0.0
-        self.results: list[Result] | None = None
+        self.results: object = None
         self.error: Exception | None = None
 
     def run(self) -> None:
@@ -47,8 +48,8 @@ class Worker(threading.Thread):
         self._cancelled.set()
 
 
-class _Baking:
-    """What the two Bake operators share. They differ in the object that is baked."""
+class Baking:
+    """What the Bake operators share. They differ in what is baked."""
 
     if TYPE_CHECKING:  # the operator's own
         def report(self, type: set[str], message: str) -> None: ...
@@ -57,24 +58,33 @@ class _Baking:
         """The objects to bake, the active one first. Raises UserError."""
         return targets(context)
 
+    def _prepare(self, context: bpy.types.Context,
+                 tiles: Callable[[bpy.types.Object], Path | None] = lambda _: None):
+        """What is to be baked, read from the scene. Raises UserError."""
+        return prepare_batch(context, self._begin(context), context.scene.neural_gash, tiles)
+
+    def _finish(self, context: bpy.types.Context, batch, results) -> set[str]:
+        """Write the results and report. Raises UserError."""
+        return self._report(finish_batch(context, batch, results))
+
     def _undo(self, context: bpy.types.Context) -> None:
         """Take `_begin` back, as nothing came of it."""
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Bake at once."""
         try:
-            batch = prepare_batch(context, self._begin(context), context.scene.neural_gash)
-            return self._report(finish_batch(context, batch, run(batch.baking)))
+            batch = self._prepare(context)
+            return self._finish(context, batch, run(batch.baking))
         except UserError as error:
             return self._fail(context, error)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         """Read the scene, and bake beside the window."""
         try:
-            batch = prepare_batch(context, self._begin(context), context.scene.neural_gash, _tiles)
+            batch = self._prepare(context, _tiles)
         except UserError as error:
             return self._fail(context, error)
-        self._batch, self._worker = batch, Worker(batch)
+        self._batch, self._worker = batch, Worker(batch.baking)
         self._timer = context.window_manager.event_timer_add(_TICK, window=context.window)
         context.window_manager.modal_handler_add(self)
         context.window_manager.progress_begin(0, 100)
@@ -94,7 +104,7 @@ class _Baking:
             state.progress = self._worker.progress
             context.window_manager.progress_update(100 * state.progress)
             if context.workspace:
-                names = ", ".join(job.name for job in self._batch.jobs)
+                names = ", ".join(self._batch.names)
                 context.workspace.status_text_set(
                     f"Baking {names}: {100 * state.progress:.0f} %   (Esc cancels)")
             state.redraw(context)
@@ -103,7 +113,7 @@ class _Baking:
         if self._worker.results is None:
             return self._fail(context, self._worker.error or UserError("The bake was stopped."))
         try:
-            return self._report(finish_batch(context, self._batch, self._worker.results))
+            return self._finish(context, self._batch, self._worker.results)
         except UserError as error:
             return self._fail(context, error)
 
@@ -168,7 +178,7 @@ def _bake_refusal(context: bpy.types.Context) -> str:
     return refusal(context.object)
 
 
-class NEURAL_GASH_OT_bake(_Baking, bpy.types.Operator):
+class NEURAL_GASH_OT_bake(Baking, bpy.types.Operator):
     """Bake how light reaches every point of the active mesh and other selected ones, and show it lit by the World"""
 
     bl_idname = "neural_gash.bake"
@@ -184,7 +194,7 @@ class NEURAL_GASH_OT_bake(_Baking, bpy.types.Operator):
         return not reason
 
 
-class NEURAL_GASH_OT_bake_applied_copy(_Baking, bpy.types.Operator):
+class NEURAL_GASH_OT_bake_applied_copy(Baking, bpy.types.Operator):
     """Make a copy of the object with its modifiers applied, and bake that; the object itself stays as it is"""
 
     bl_idname = "neural_gash.bake_applied_copy"

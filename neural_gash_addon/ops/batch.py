@@ -43,6 +43,11 @@ class Batch:
     shared: bool  # one texture for all
     baking: Generator[float, None, list[Result]]
 
+    @property
+    def names(self) -> list[str]:
+        """Of the objects that are baked."""
+        return [job.name for job in self.jobs]
+
 
 def prepare_batch(context: bpy.types.Context, objects: Sequence[bpy.types.Object | None], settings: NeuralGashSettings,
                   tiles: Callable[[bpy.types.Object], Path | None] = lambda _: None) -> Batch:

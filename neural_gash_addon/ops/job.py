@@ -36,7 +36,7 @@ from ..scene.read import (
     fingerprint,
     group_mode,
     is_group,
-    read_albedo,
+    read_finish,
     read_object,
     read_occluders,
     refusal,
@@ -97,7 +97,7 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
         if settings.target != TEXTURE and attribute_count(3 * settings.order ** 2) > EEVEE_ATTRIBUTES:
             raise UserError(f"With bounces, an order-{settings.order} bake takes more than the {EEVEE_ATTRIBUTES} "
                             "attributes that EEVEE draws; choose order 4 or less, or bake to a texture.")
-        reflection = Reflection(read_albedo(obj, mode, depsgraph), settings.bounces)
+        reflection = Reflection(read_finish(obj, mode, depsgraph)[:, :3], settings.bounces)
     occluders = read_occluders(obj, mode, depsgraph)
     bake: Callable[..., Generator[float, None, Transfer | TextureTransfer]]
     texture = None

@@ -14,6 +14,7 @@ from ..ops.job import percent
 from ..properties import COLLECTION, DENSITY, FIT, RAYS, TEXTURE, NeuralGashSettings
 from ..scene import staleness
 from ..scene.attributes import RECORD, has_bake
+from ..scene.gloss_bounce import bounces_shown, has_bounces
 from ..scene.preview import is_on
 
 
@@ -99,6 +100,11 @@ class NEURAL_GASH_PT_light(_Panel, bpy.types.Panel):
         layout.prop(settings, "light_strength")
         layout.prop(settings, "soften")
         layout.prop(settings, "gloss")
+        obj = context.object
+        if settings.gloss and has_bake(obj):
+            layout.operator("neural_gash.bake_gloss", icon="SHADING_RENDERED")
+            if has_bounces(obj.data) and not bounces_shown(obj.data):
+                layout.label(text="Glossy bounces are of another light: not shown", icon="ERROR")
 
 
 class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):

@@ -23,6 +23,7 @@ from ..backend.record import BakeRecord
 from ..backend.spherical_harmonics import MAX_ORDER
 from ..backend.texture import TextureTransfer
 from ..backend.transfer import Transfer
+from .gloss_bounce import discard_bounces
 from .images import attach, bake_images, detach, make_images
 from .uv_maps import check_room, remove_own_uv, write_own_uv
 
@@ -168,6 +169,7 @@ def discard(data: bpy.types.Mesh) -> None:
     _choose_attributes(data, chosen)
     remove_own_uv(data)
     detach(data)
+    discard_bounces(data)
     del data[RECORD]
     data.update_tag()
 

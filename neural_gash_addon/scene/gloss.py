@@ -7,12 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend import gloss
+from ..backend import spherical_harmonics as sh
 from ..backend.record import BakeRecord
 from ..backend.texture import CHANNELS
+from .gloss_bounce import bounces_for
 from .gloss_nodes import build_gloss_group, gloss_image_count, gloss_images
-from .images import RECORD, bake_images
+from .images import BOUNCED, RECORD, bake_images
 
-_transfer: dict[tuple[int, ...], NDArray[np.float32]] = {}  # images' session uids -> (texels, K); the last one only
+_transfer: dict[tuple[int, ...], NDArray[np.float32]] = {}  # images' session uids -> (texels, terms); the last one only
 
 
 def can_gloss(record: BakeRecord) -> bool:
@@ -43,25 +45,41 @@ def light_gloss(data: bpy.types.Mesh, record: BakeRecord, node: bpy.types.Node, 
     """
     for axis, row in zip("XYZ", turn, strict=True):
         node.inputs[f"Turn {axis}"].default_value = row.tolist()
-    transfer = _coefficients(data, record)
+    transfer = _numbers(bake_images(data, record), record)
     images = gloss_images(node.node_tree)
     numbers = np.empty((len(images), len(transfer), CHANNELS), np.float32)
     gloss.lit_channels(transfer, light, CHANNELS, numbers)
+    bounces = bounces_for(data, light)
+    if bounces is not None:
+        numbers += _bounced(bake_images(data, bounces, BOUNCED), bounces, numbers.shape)
     for image, pixels in zip(images, numbers, strict=True):
         image.pixels.foreach_set(pixels.ravel())
         image.update()
 
 
-def _coefficients(data: bpy.types.Mesh, record: BakeRecord) -> NDArray[np.float32]:
-    """(texels, K) of a bake's images."""
-    images = bake_images(data, record)
+def _numbers(images: list[bpy.types.Image], record: BakeRecord) -> NDArray[np.float32]:
+    """(texels, terms) of a bake's images."""
     key = tuple(image.session_uid for image in images)
     if key not in _transfer:
         _transfer.clear()
-        out = np.empty((record.side ** 2, CHANNELS * len(images)), np.float32)
-        pixels = np.empty((record.side ** 2, CHANNELS), np.float32)
-        for number, image in enumerate(images):
-            image.pixels.foreach_get(pixels.ravel())
-            out[:, CHANNELS * number:CHANNELS * (number + 1)] = pixels
-        _transfer[key] = np.ascontiguousarray(out[:, :record.terms])
+        _transfer[key] = _read(images, record)
     return _transfer[key]
+
+
+def _read(images: list[bpy.types.Image], record: BakeRecord) -> NDArray[np.float32]:
+    """`_numbers`, from the images."""
+    out = np.empty((record.side ** 2, CHANNELS * len(images)), np.float32)
+    pixels = np.empty((record.side ** 2, CHANNELS), np.float32)
+    for number, image in enumerate(images):
+        image.pixels.foreach_get(pixels.ravel())
+        out[:, CHANNELS * number:CHANNELS * (number + 1)] = pixels
+    return np.ascontiguousarray(out[:, :record.terms])
+
+
+def _bounced(images: list[bpy.types.Image], record: BakeRecord, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """What glossy bounces add to `gloss.lit_channels`: their numbers, and the radiance of what is dull."""
+    values = _read(images, record)
+    out = np.zeros((shape[1], shape[0] * shape[2]), np.float32)
+    out[:, :3] = values[:, :3] / (np.pi * sh.normalisation(0, 0))
+    out[:, 3:3 + record.terms] = values
+    return out.reshape(shape[1], shape[0], shape[2]).transpose(1, 0, 2)

@@ -16,41 +16,43 @@ from ..backend.exchange import atomic, check_writable, reason
 from ..backend.record import BakeRecord
 from ..backend.texture import TextureTransfer, image_count
 
-_IMAGES = "neural_gash_images"  # custom property of the mesh: its transfer images by number
+TRANSFER = "neural_gash_images"      # custom property of the mesh: its transfer images by number
+BOUNCED = "neural_gash_gloss_images"  # and those of glossy bounces, which are of one light
 RECORD = "neural_gash"         # custom property of an image: the record of the bake it belongs to
 
 
-def make_images(name: str, transfer: TextureTransfer, folder: Path | None, half: bool, parts: str = ""
-                ) -> list[bpy.types.Image]:
+def make_images(name: str, transfer: TextureTransfer, folder: Path | None, half: bool, parts: str = "",
+                label: str = "prt") -> list[bpy.types.Image]:
     """New images that hold a texture bake, four coefficients each.
 
     Args:
         folder: where the files go; they are packed into the .blend where not given.
         half: 16 bits a channel instead of 32.
         parts: what the record does not say of each object that shares the texture, as JSON.
+        label: what the files are called after the object.
     Raises:
         UserError: files cannot be written there, or others' are in the way.
     """
     if folder is not None:
-        return _load(name, _write(name, transfer, folder, half, parts), transfer.record, half)
+        return _load(name, _write(name, transfer, folder, half, parts, label), transfer.record, half)
     with tempfile.TemporaryDirectory(prefix="neural_gash-") as temporary:
-        images = _load(name, _write(name, transfer, Path(temporary), half, parts), transfer.record, half)
+        images = _load(name, _write(name, transfer, Path(temporary), half, parts, label), transfer.record, half)
         for image in images:
             image.pack()
             image.filepath_raw = f"//{Path(image.filepath_raw).name}"  # the file itself is going
         return images
 
 
-def attach(data: bpy.types.Mesh, images: Sequence[bpy.types.Image]) -> None:
+def attach(data: bpy.types.Mesh, images: Sequence[bpy.types.Image], key: str = TRANSFER) -> None:
     """Make the images those of the mesh."""
-    data[_IMAGES] = {str(number): image for number, image in enumerate(images)}
+    data[key] = {str(number): image for number, image in enumerate(images)}
 
 
-def detach(data: bpy.types.Mesh) -> None:
+def detach(data: bpy.types.Mesh, key: str = TRANSFER) -> None:
     """Take the mesh its images; a preview may show them until it goes."""
-    images = [image for image in _attached(data) if image is not None]
-    if _IMAGES in data:
-        del data[_IMAGES]
+    images = [image for image in _attached(data, key) if image is not None]
+    if key in data:
+        del data[key]
     remove_unused(images)
 
 
@@ -60,13 +62,13 @@ def remove_unused(images: Iterable[bpy.types.Image]) -> None:
         bpy.data.images.remove(image)
 
 
-def bake_images(data: bpy.types.Mesh, record: BakeRecord) -> list[bpy.types.Image]:
-    """The images of the bake on a mesh.
+def bake_images(data: bpy.types.Mesh, record: BakeRecord, key: str = TRANSFER) -> list[bpy.types.Image]:
+    """The images of the bake on a mesh, or of its glossy bounces, whose record has their number.
 
     Raises:
         UserError: one is missing, cannot be loaded, has another size, or belongs to another bake.
     """
-    images = [image for image in _attached(data) if image is not None]
+    images = [image for image in _attached(data, key) if image is not None]
     if len(images) != image_count(record.terms):
         raise UserError(f"The bake of '{data.name}' has lost some of its images; bake again.")
     for image in images:
@@ -83,19 +85,20 @@ def bake_images(data: bpy.types.Mesh, record: BakeRecord) -> list[bpy.types.Imag
     return images
 
 
-def _attached(data: bpy.types.Mesh) -> list[bpy.types.Image | None]:
+def _attached(data: bpy.types.Mesh, key: str) -> list[bpy.types.Image | None]:
     """The images of a mesh in their order; None for one that was deleted."""
-    stored = data.get(_IMAGES)
+    stored = data.get(key)
     if not hasattr(stored, "keys"):
         return []
     return [image if isinstance(image := stored[key], bpy.types.Image) else None
             for key in sorted(stored.keys(), key=int)]
 
 
-def _write(name: str, transfer: TextureTransfer, folder: Path, half: bool, parts: str) -> list[Path]:
+def _write(name: str, transfer: TextureTransfer, folder: Path, half: bool, parts: str, label: str
+           ) -> list[Path]:
     """Write the files, each in one step, and the record beside them."""
     clean = re.sub(r"[^\w.-]+", "_", name) or "mesh"
-    paths = [folder / f"{clean}_prt_{number}.exr" for number in range(image_count(transfer.record.terms))]
+    paths = [folder / f"{clean}_{label}_{number}.exr" for number in range(image_count(transfer.record.terms))]
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -111,7 +114,7 @@ def _write(name: str, transfer: TextureTransfer, folder: Path, half: bool, parts
     try:
         for number, path in enumerate(paths):
             exr.write(path, transfer.image(number, filled).reshape(side, side, 4), text, half)
-        with atomic(folder / f"{clean}_prt.json") as draft:
+        with atomic(folder / f"{clean}_{label}.json") as draft:
             draft.write_text((f'{text[:-1]}, "objects": {parts}}}' if parts else text) + "\n")
     except OSError as error:
         raise UserError(f"The textures cannot be written to '{folder}' ({reason(error)}).") from error

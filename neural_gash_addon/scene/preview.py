@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..backend import spherical_harmonics as sh
 from ..backend.errors import UserError
 from ..backend.geometry import TEXEL
+from ..backend.record import BakeRecord
 from .attributes import attribute_count, check_whole, has_bake, read_record
 from .frames import as_array, bake_frame
 from .gloss import can_gloss, gloss_group, light_gloss
@@ -23,6 +24,7 @@ from .nodes import DEFAULT_ALBEDO, ensure_group, group_terms, is_group, set_ligh
 
 _STATE = "neural_gash_preview"  # custom property of a preview material: what its slot held
 EEVEE_ATTRIBUTES = 14           # with 15, EEVEE draws magenta, whatever their types
+DEFAULT_ROUGHNESS = 0.5         # of a material that says nothing of it
 COLOUR_SOCKETS = {"BSDF_PRINCIPLED": "Base Color", "BSDF_DIFFUSE": "Color"}
 _TEXTURES_ON_UV = {"TEX_IMAGE"}
 
@@ -120,7 +122,7 @@ def update_light(obj: bpy.types.Object, light: NDArray) -> None:
     terms = record.order ** 2
     if len(light) < terms:
         raise ValueError(f"the light has {len(light)} coefficients, the bake {terms}")
-    turn = np.array(record.frame).reshape(3, 3) @ bake_frame(obj).T
+    turn = turn_since(obj, record)
     seen = sh.rotate(np.asarray(light)[:terms], turn)
     if any(not is_gloss(node.node_tree) and group_terms(node.node_tree) != (record.order, record.colours)
            for node in _group_nodes(obj)):
@@ -133,6 +135,16 @@ def update_light(obj: bpy.types.Object, light: NDArray) -> None:
             light_gloss(obj.data, record, node, seen, turn)
         else:
             set_light(node, seen)
+
+
+def turn_since(obj: bpy.types.Object, record: BakeRecord) -> NDArray:
+    """(3, 3) from world axes into the frame of a bake: the identity unless the object was turned since."""
+    return np.array(record.frame).reshape(3, 3) @ bake_frame(obj).T
+
+
+def is_preview(material: bpy.types.Material) -> bool:
+    """Whether a material is a preview's, not the person's."""
+    return _STATE in material
 
 
 def _state(material: bpy.types.Material | None):
@@ -198,7 +210,7 @@ def _set_gloss(tree: bpy.types.NodeTree, shading: bpy.types.Node, shader: bpy.ty
         if "Metallic" in shader.inputs and not shader.inputs["Metallic"].is_linked:
             metallic = shader.inputs["Metallic"].default_value
     else:
-        shading.inputs["Roughness"].default_value = 0.5
+        shading.inputs["Roughness"].default_value = DEFAULT_ROUGHNESS
     colour = shading.inputs["Albedo"]
     mirrored = [SPECULAR + metallic * (value - SPECULAR) for value in colour.default_value[:3]]
     shading.inputs["Specular"].default_value = (*mirrored, 1.0)

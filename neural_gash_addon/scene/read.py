@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..backend.errors import UserError
 from ..backend.geometry import Surface, TriangleMesh, unit
-from .albedo import triangle_albedo
+from .albedo import triangle_finish
 from .attributes import RECORD, discard
 from .evaluation import evaluated, revealed, shown_objects
 from .frames import Array, as_array, bake_frame, rotation_part
@@ -176,15 +176,15 @@ def read_occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgr
             for local, triangles, _, matrix in _occluders(obj, mode, depsgraph)]
 
 
-def read_albedo(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph) -> Array:
-    """(F, 3) albedo of the triangles of `obj`, then of those that `read_occluders` gives, in its order."""
+def read_finish(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph) -> Array:
+    """(F, 7) of `triangle_finish` of the triangles of `obj`, then of those of `read_occluders`, in its order."""
     with evaluated(obj, depsgraph) as copy:
         mesh = copy.to_mesh()
         try:
-            own = triangle_albedo(obj, mesh, _triangle_corners(mesh))
+            own = triangle_finish(obj, mesh, _triangle_corners(mesh))
         finally:
             copy.to_mesh_clear()
-    return np.concatenate([own, *(albedo for _, _, albedo, _ in _occluders(obj, mode, depsgraph, coloured=True))])
+    return np.concatenate([own, *(finish for _, _, finish, _ in _occluders(obj, mode, depsgraph, coloured=True))])
 
 
 def fingerprint(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, occluder_mode: str = SELF,
@@ -240,7 +240,7 @@ def fingerprint(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, occluder_
             entries.append(shapes[id(local)][1] + _place(seen @ place, grain))
         digest.update(b"".join(sorted(entries)))
     if bounces:
-        digest.update(np.round(read_albedo(obj, occluder_mode, depsgraph), 4).tobytes())
+        digest.update(np.round(read_finish(obj, occluder_mode, depsgraph)[:, :3], 4).tobytes())
     return digest.hexdigest() + ":" + ",".join(text)
 
 
@@ -258,9 +258,9 @@ def same_fingerprint(first: str, second: str) -> bool:
 
 def _occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph, coloured: bool = False,
                ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int32], Array, Array]]:
-    """(local positions, triangles, albedo, world matrix) of each object and instance that blocks, but `obj`.
+    """(local positions, triangles, finish, world matrix) of each object and instance that blocks, but `obj`.
 
-    The albedo (F, 3) is empty unless `coloured`: images take time to read.
+    The finish (F, 7) is empty unless `coloured`: images take time to read.
     """
     if mode == SELF:
         return
@@ -306,7 +306,7 @@ def _instances(depsgraph: bpy.types.Depsgraph, owners: set[int] | None, baked: b
 
 def _solid_arrays(solid: bpy.types.Object, coloured: bool
                   ) -> tuple[NDArray[np.float32], NDArray[np.int32], Array] | None:
-    """Local positions, triangles and their albedo (F, 3) of an evaluated object; None where it has no faces."""
+    """Local positions, triangles and their finish (F, 7) of an evaluated object; None where it has no faces."""
     try:
         mesh = solid.to_mesh()
     except RuntimeError:  # Blender's way to say that the object has no geometry, as a second metaball
@@ -320,8 +320,8 @@ def _solid_arrays(solid: bpy.types.Object, coloured: bool
         corners = _triangle_corners(mesh)
         triangles = _corner_vertices(mesh)[corners]
         whole = np.isfinite(positions).all(axis=1)[triangles].all(axis=1)
-        albedo = triangle_albedo(solid, mesh, corners)[whole] if coloured else np.zeros((0, 3))
-        return np.nan_to_num(positions), triangles[whole], albedo
+        finish = triangle_finish(solid, mesh, corners)[whole] if coloured else np.zeros((0, 7))
+        return np.nan_to_num(positions), triangles[whole], finish
     finally:
         solid.to_mesh_clear()
 

@@ -11,8 +11,11 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..backend.errors import UserError
+from ..backend.record import BakeRecord
 from .attributes import check_whole, has_bake, read_record
-from .read import SELF, fingerprint, same_fingerprint
+from .gloss_bounce import finish_fits, has_bounces
+from .preview import is_preview
+from .read import SELF, fingerprint, read_finish, same_fingerprint
 from .uv_maps import read_uv
 
 CURRENT, STALE, NONE = "CURRENT", "STALE", "NONE"
@@ -40,16 +43,20 @@ def check(obj: bpy.types.Object) -> bool:
     """Compare the object with its bake now: whether the bake still fits. Main thread only."""
     try:
         record = read_record(obj)
-        uv = read_uv(obj.data, record.uv_map) if record.uv_map else None
-        now = fingerprint(obj, bpy.context.evaluated_depsgraph_get(), record.occluders, uv,
-                          record.colours == 3)
-        current = same_fingerprint(now, record.fingerprint)
+        current = same(obj, record) and _gloss_fits(obj, record)
         check_whole(obj.data, record)
     except UserError:  # changed so far that it could not be baked again as it was
         current = False
     _known[obj.session_uid] = CURRENT if current else STALE
     _changed.discard(obj.session_uid)
     return current
+
+
+def same(obj: bpy.types.Object, record: BakeRecord) -> bool:
+    """Whether the object's shape, and what shadows it, are those of a bake. Raises UserError as `fingerprint`."""
+    uv = read_uv(obj.data, record.uv_map) if record.uv_map else None
+    now = fingerprint(obj, bpy.context.evaluated_depsgraph_get(), record.occluders, uv, record.colours == 3)
+    return same_fingerprint(now, record.fingerprint)
 
 
 def register() -> None:
@@ -77,6 +84,9 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     uids = {update.id.original.session_uid for update in depsgraph.updates
             if isinstance(update.id, bpy.types.Object)
             and (update.is_updated_geometry or update.is_updated_transform)}
+    if any(isinstance(update.id, bpy.types.Material) and not is_preview(update.id.original)
+           for update in depsgraph.updates):
+        uids.update(obj.session_uid for obj in scene.objects if _reflects(obj))
     if uids:
         _changed.update(uids)
         if not (bpy.app.background or _comparing):
@@ -130,6 +140,20 @@ def _compare_changed() -> None:
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
                 area.tag_redraw()
+
+
+def _gloss_fits(obj: bpy.types.Object, record: BakeRecord) -> bool:
+    """Whether the glossy bounces, if there are any, are of the materials as they are."""
+    return not has_bounces(obj.data) or finish_fits(
+        obj.data, read_finish(obj, record.occluders, bpy.context.evaluated_depsgraph_get()))
+
+
+def _reflects(obj: bpy.types.Object) -> bool:
+    """Whether the bake depends on materials."""
+    try:
+        return has_bake(obj) and (has_bounces(obj.data) or read_record(obj).colours == 3)
+    except UserError:
+        return False
 
 
 def _has_occluders(obj: bpy.types.Object) -> bool:

@@ -51,8 +51,8 @@ def test_white_furnace_gives_the_closed_form():
     for geometry in (shapes.cube(inside=True), (shapes.sphere(2)[0], shapes.sphere(2)[1][:, ::-1])):
         for albedo in (0.3, 0.9):
             found = bounces_of([(geometry, (albedo,) * 3)], number=1, budget=500)
-            assert not np.abs(found._direct).max() > 0                   # closed: no light from outside
-            emitted = np.ones((len(found._direct), 1), np.float32)       # radiosity 1 of its own
+            assert not np.abs(found.direct).max() > 0                   # closed: no light from outside
+            emitted = np.ones((len(found.direct), 1), np.float32)       # radiosity 1 of its own
             total, now = emitted.astype(float), emitted
             for _ in range(400):
                 now = (albedo * found.gathered(now)).astype(np.float32)
@@ -62,11 +62,11 @@ def test_white_furnace_gives_the_closed_form():
 
 def test_what_a_sees_of_b_is_what_b_sees_of_a():
     found = bounces_of(cornell(), budget=150, number=1)
-    count = len(found._met)
+    count = len(found.met)
     seen = np.zeros((count, count))
-    rays = found._met.shape[1]
-    rows, columns = np.nonzero(found._met >= 0)
-    np.add.at(seen, (rows, found._met[rows, columns]), 1 / rays)
+    rays = found.met.shape[1]
+    rows, columns = np.nonzero(found.met >= 0)
+    np.add.at(seen, (rows, found.met[rows, columns]), 1 / rays)
     flow = found._areas()[:, None] * seen
     big = (flow + flow.T) > np.percentile((flow + flow.T)[flow > 0], 95)
     # binomial: the variance of A F is about A^2 F / rays; 5 standard errors of the difference
@@ -91,7 +91,7 @@ def test_energy_never_grows_and_the_tail_stops():
 def test_black_traces_nothing():
     scene = [(part, (0, 0, 0)) for part, _ in cornell()]
     found = bounces_of(scene)
-    assert found.used == 0 and not len(found._met)
+    assert found.used == 0 and not len(found.met)
     mesh = at(scene, [[0, 0, 0]], [[0, 0, 1]])
     assert not methods.run(found.gather(mesh, 64)).any()
 

@@ -96,7 +96,7 @@ def test_the_picture_is_the_numbers(room):
 
 
 def test_images_and_previews_give_their_colours(make, settings):
-    from neural_gash_addon.scene.read import read_albedo
+    from neural_gash_addon.scene.read import read_finish
     obj = make([(-1, -1, 0), (0, -1, 0), (0, 1, 0), (-1, 1, 0), (1, -1, 0), (1, 1, 0)], [(0, 1, 2, 3), (1, 4, 5, 2)])
     obj.data.uv_layers.new(name="Mine")
     for loop in obj.data.loops:
@@ -109,7 +109,7 @@ def test_images_and_previews_give_their_colours(make, settings):
     _paint(obj, (0, 0, 0), image)
 
     def albedo():
-        return read_albedo(obj, "SELF", bpy.context.evaluated_depsgraph_get())
+        return read_finish(obj, "SELF", bpy.context.evaluated_depsgraph_get())[:, :3]
 
     expected = [(0.9, 0.1, 0.2)] * 2 + [(0.1, 0.6, 0.3)] * 2
     np.testing.assert_allclose(albedo(), expected, atol=1e-3)
