@@ -108,8 +108,7 @@ def motor(points: Array, normals: Array) -> Array:
         points: (..., 3), any unit.
         normals: (..., 3), of any length; a zero normal counts as e_y.
     Returns:
-        (..., 32), M ~M = 1. At n = -e_y exactly, R = e12. Its gradient is infinite there: give networks
-        that are differentiated down to the normals `encode`.
+        (..., 32), M ~M = 1. At n = -e_y, R = e12. Not to be differentiated there: `encode` can be, everywhere.
     Errors:
         ValueError where the shapes differ or do not end in 3.
     """
@@ -126,7 +125,7 @@ def motor(points: Array, normals: Array) -> Array:
     smaller = 0.5 * (radius / length) / larger
     up = y >= 0
     cosine, sine = lib.where(up, larger, smaller), lib.where(up, smaller, larger)
-    off = radius > 0
+    off = radius > 1e-30 * length  # nearer is the pole: with subnormal numbers x / radius has no digits left
     divisor = lib.where(off, radius, lib.ones_like(radius))
     return _assemble(points, cosine, sine * lib.where(off, x / divisor, lib.ones_like(x)), -sine * (z / divisor))
 
@@ -155,9 +154,8 @@ def _assemble(points: Array, scalar: Array, e12: Array, e23: Array) -> Array:
     """T R for the rotor R = scalar + e12 + e23: R - 1/2 (p R) e_inf, (..., 32)."""
     x, y, z = -0.5 * points[..., 0], -0.5 * points[..., 1], -0.5 * points[..., 2]
     translation = (x * scalar - y * e12, y * scalar + x * e12 - z * e23, z * scalar + y * e23, x * e23 + z * e12)
-    shape = (*translation[0].shape, BLADE_COUNT)
-    like = translation[0]
-    out = np.zeros(shape, dtype=like.dtype) if _library(like) is np else like.new_zeros(shape)
+    shape, like = (*scalar.shape, BLADE_COUNT), translation[0]
+    out = np.zeros(shape, dtype=like.dtype) if _library(points) is np else like.new_zeros(shape)
     out[..., _SCALAR], out[..., _E12], out[..., _E23] = scalar, e12, e23
     for value, (with_e4, with_e5) in zip(translation, _AT_INFINITY, strict=True):
         out[..., with_e4] = value
