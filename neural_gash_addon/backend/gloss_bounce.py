@@ -29,7 +29,7 @@ from .record import BakeRecord
 from .texels import NormalMap, texel_points
 from .texture import TextureTransfer
 
-RAYS = 128            # of a texel
+RAYS = 256            # of a texel: with 128 a mirroring floor shows grain
 _RAYS_AT_ONCE = 1 << 15
 _SETS = 16
 _TILE = 1 << 18       # texels

@@ -66,3 +66,13 @@ def test_a_killed_bake_goes_on_and_gives_the_same_bytes(run, ply, tmp_path, kill
     for a, b in zip(_pixels(whole / "maps"), _pixels(torn / "maps"), strict=True):
         assert np.array_equal(a, b)
     assert [p.name for p in torn.iterdir()] == ["maps"]
+
+
+def test_several_objects_share_a_texture_as_large_as_they_need(run, blend, tmp_path):
+    done = run("bake", blend, "--object", "Ring", "--object", "Roof", "--object", "No faces", "--texture", "fit",
+               "--share", "--order", "2", "--tolerance", "0.1", "--textures", tmp_path / "maps", "--json")
+    records = [json.loads(line) for line in done.stdout.splitlines()]
+    assert done.returncode == 2 and "no faces" in done.stderr   # one is named, the others are done
+    baked = {r["object"]: r for r in records if "error" not in r}
+    assert set(baked) == {"Ring", "Roof"} and baked["Ring"]["side"] == baked["Roof"]["side"]
+    assert len(list((tmp_path / "maps").glob("*.exr"))) == 1

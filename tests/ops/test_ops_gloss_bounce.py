@@ -106,7 +106,7 @@ def test_they_survive_saving_and_go_with_the_bake(room, tmp_path):
     bpy.context.view_layer.objects.active = floor
     assert bpy.ops.neural_gash.clear() == {"FINISHED"}
     assert not [i for i in bpy.data.images if "PRT" in i.name and "lobes" not in i.name]
-    assert not [k for k in floor.data.keys() if k.startswith("neural_gash")]
+    assert not [k for k, _ in floor.data.items() if k.startswith("neural_gash")]
 
 
 def test_what_cannot_have_them_is_refused(room, settings, refused, make):
