@@ -134,6 +134,18 @@ class BlockedEstimator:
 
         return np.concatenate(list(pool.map(part, range(0, len(points), _TURNED_AT_ONCE))))
 
+    def turned(self, pool: ThreadPoolExecutor, points: NDArray, local: NDArray) -> NDArray[np.float32]:
+        """The blocked part (n, K) in the bake frame. Where nothing is blocked, nothing is turned."""
+        out = np.zeros(local.shape, np.float32)
+        some = np.flatnonzero(local[:, 0])
+
+        def part(start: int) -> None:
+            here = some[start:start + _TURNED_AT_ONCE]
+            out[here] = sh.rotate_each(local[here], self._frames(points[here]))
+
+        list(pool.map(part, range(0, len(some), _TURNED_AT_ONCE)))
+        return out
+
     def _frames(self, points: NDArray) -> NDArray[np.float64]:
         return sampling.frames(self._normals[points], self._angles[points].astype(np.float64))
 

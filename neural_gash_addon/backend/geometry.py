@@ -49,7 +49,7 @@ class Surface:
     def vertex_points(self) -> TriangleMesh:
         """Points at the vertices, or at the corners where normals split. Raises UserError as `from_corners`."""
         return TriangleMesh.from_corners(self.positions, self.triangles, self.corner_vertices, self.corner_normals,
-                                         self.corner_faces, self.resolution)
+                                         self.corner_faces, self.resolution, self.corners)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,10 +64,14 @@ class TriangleMesh:
     elements: NDArray[np.int32]     # (E,) point of each vertex (POINT), face corner (CORNER) or texel (TEXEL)
     domain: str                     # POINT or CORNER, Blender's attribute domains; or TEXEL
     resolution: float               # spacing of the coordinates' floats, metres
+    corners: NDArray[np.int32] | None = None  # (F, 3) of CORNER: face corners of each triangle, indices of `elements`
+    texels: NDArray[np.int64] | None = None   # (N,) of TEXEL: row * side + column, rising
+    side: int = 0                             # of TEXEL: texels a side
 
     @staticmethod
     def from_corners(positions: NDArray, triangles: NDArray, corner_vertices: NDArray, corner_normals: NDArray,
-                     corner_faces: NDArray, resolution: float | None = None) -> TriangleMesh:
+                     corner_faces: NDArray, resolution: float | None = None, corners: NDArray | None = None,
+                     ) -> TriangleMesh:
         """Decide the domain from the shading, and build the points.
 
         Args:
@@ -76,6 +80,7 @@ class TriangleMesh:
                 normal. corner_faces: (C,) its polygon, non-decreasing.
             resolution: spacing of the floats the coordinates came in; float32's at the largest
                 coordinate where not given.
+            corners: (F, 3) face corners of each triangle, to know which points lie beside which.
         Raises:
             UserError: no faces, or coordinates that are not finite.
         """
@@ -101,7 +106,7 @@ class TriangleMesh:
         point_vertices, normals = corner_vertices[first], unit(corner_normals[first])
         insets = _insets(positions, corner_vertices, corner_faces, elements, normals)
         return TriangleMesh(positions, triangles, positions[point_vertices], normals, normals + INSET * insets,
-                            elements, CORNER, resolution)
+                            elements, CORNER, resolution, corners)
 
     @staticmethod
     def from_triangles(positions: NDArray, triangles: NDArray, smooth: bool = True) -> TriangleMesh:
@@ -122,7 +127,8 @@ class TriangleMesh:
             np.add.at(vertex_normals, triangles.ravel(), corner_normals * angles.reshape(-1, 1))
             corner_normals = unit(vertex_normals)[triangles.ravel()]
         faces = np.repeat(np.arange(len(triangles)), 3)
-        return TriangleMesh.from_corners(positions, triangles, triangles.ravel(), corner_normals, faces)
+        return TriangleMesh.from_corners(positions, triangles, triangles.ravel(), corner_normals, faces,
+                                         corners=np.arange(triangles.size, dtype=np.int32).reshape(-1, 3))
 
 
 def unit(vectors: NDArray) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from . import embree_bake
+from . import embree_bake, hybrid_bake
 from . import spherical_harmonics as sh
 from .bounce import Reflection
 from .errors import UserError
@@ -54,6 +54,8 @@ METHODS: dict[str, Method] = {m.name: m for m in (
            traces=False, bake=_analytic),
     Method("embree", "Ray traced", "Traces rays with Embree to find what blocks the light; the reference",
            traces=True, bake=embree_bake.bake),
+    Method("hybrid", "Few rays and network", "Traces few rays, and a small network takes the rest from neighbours: "
+           "smooth at once, and exact with many rays", traces=True, bake=hybrid_bake.bake),
 )}
 
 

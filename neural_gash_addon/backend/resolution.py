@@ -125,7 +125,8 @@ def _traced(points: TriangleMesh, *, method: str, order: int, scene: Occluders |
             first: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Two traces (n, K) of the same points, with seeds of their own; `first` numbers them."""
     rays = _RAYS if scene is not None else None
-    one, two = (methods.run(methods.bake(points, method, order, rays=rays, scene=scene, threads=threads,
+    plain = "embree" if scene is not None else method  # a sample has no neighbours to learn from
+    one, two = (methods.run(methods.bake(points, plain, order, rays=rays, scene=scene, threads=threads,
                                          seed=int(np.random.SeedSequence([seed, 1, first + n]).generate_state(1)[0])))
                 for n in range(2))
     return one.coefficients.astype(np.float64), two.coefficients.astype(np.float64)

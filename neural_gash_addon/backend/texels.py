@@ -57,7 +57,7 @@ def texel_points(surface: Surface, coverage: Coverage, normal_maps: Sequence[Nor
             rows = mapped[start:start + _AT_ONCE]
             normals[rows] = _mapped(normal_map, corners[rows], coverage.centres[rows], normals[rows])
     return TriangleMesh(surface.positions, surface.triangles, points, normals, clearance,
-                        np.zeros(0, np.int32), TEXEL, surface.resolution)
+                        np.zeros(0, np.int32), TEXEL, surface.resolution, texels=coverage.texels, side=coverage.side)
 
 
 def _mapped(normal_map: NormalMap, corners: NDArray, weights: NDArray, smooth: NDArray) -> NDArray[np.float64]:

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The hybrid beside plain Embree at equal total time, on meshes that nothing was tuned on; per mesh and category.
+
+`.venv/bin/python benchmarks/networks.py` reads ../shared/meshes/validation, or --folder.
+"""
+from __future__ import annotations
+
+import argparse
+import csv
+import statistics
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from meshes import FOLDER
+from table import Table, seconds
+
+from neural_gash_addon.backend import methods, metrics
+from neural_gash_addon.backend import spherical_harmonics as sh
+from neural_gash_addon.backend.estimator import default_threads
+from neural_gash_addon.backend.geometry import TriangleMesh
+
+BUDGETS = (4, 8, 16, 32)              # rays of Embree that set the time
+LADDER = (2, 3, 4, 6, 8, 12, 16, 24, 32)  # rays of the hybrid that are tried
+ORDER, REFERENCE_RAYS, REPEATS, TARGET = 3, 4096, 3, 0.5
+
+
+def read(path: Path) -> TriangleMesh:
+    """A mesh file, shaded smooth."""
+    found = trimesh.load(path, process=False, force="mesh")
+    return TriangleMesh.from_triangles(np.asarray(found.vertices), np.asarray(found.faces))
+
+
+def curve(mesh: TriangleMesh, reference: np.ndarray, ladder: tuple[int, ...]) -> dict[str, list[tuple[float, float]]]:
+    """(seconds, SRR) of both methods at each number of rays, measured in turns: medians over seeds."""
+    unshadowed = sh.cosine_lobe(mesh.normals, ORDER)
+    found: dict[str, list[tuple[float, float]]] = {"embree": [], "hybrid": []}
+    for rays in ladder:
+        runs: dict[str, list[tuple[float, float]]] = {name: [] for name in found}
+        for seed in range(REPEATS):
+            for name, measured in runs.items():
+                kept = []
+                spent = seconds(lambda name=name, seed=seed, kept=kept: kept.append(
+                    methods.run(methods.bake(mesh, name, ORDER, rays=rays, seed=seed)).coefficients))
+                measured.append((spent, metrics.srr(kept[0], reference, unshadowed)))
+        for name, measured in runs.items():
+            found[name].append(tuple(float(v) for v in np.median(measured, axis=0)))  # type: ignore[arg-type]
+    return found
+
+
+def at_time(points: list[tuple[float, float]], spent: float) -> float:
+    """SRR that a method reaches in a time, on lines through its logarithms; where even 2 rays take longer: theirs."""
+    times = np.maximum.accumulate([t for t, _ in points])
+    return float(np.exp(np.interp(np.log(spent), np.log(times), np.log([max(s, 1e-12) for _, s in points]))))
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--folder", type=Path, default=FOLDER / "validation")
+    parser.add_argument("--only", help="files whose name has this in it")
+    arguments = parser.parse_args()
+    categories = {}
+    if (FOLDER / "MANIFEST.csv").is_file():
+        with (FOLDER / "MANIFEST.csv").open(newline="") as file:
+            categories = {Path(row["file"]).stem: row["category"] for row in csv.DictReader(file)}
+    print(f"Order {ORDER}, {default_threads()} threads; SRR against {REFERENCE_RAYS} rays with a seed of their own. "
+          f"Each cell: the hybrid's SRR in the time that Embree takes with so many rays, over Embree's.\n")
+    print("| mesh | category | vertices | " + " | ".join(f"{b} rays" for b in BUDGETS) + " | hybrid µs/vertex at 4 |")
+    print("|---" * (4 + len(BUDGETS)) + "|", flush=True)
+    ratios: dict[int, list[tuple[str, float]]] = {budget: [] for budget in BUDGETS}
+    for path in sorted(arguments.folder.glob("*.ply")):
+        if arguments.only and arguments.only not in path.stem:
+            continue
+        mesh = read(path)
+        reference = methods.run(methods.bake(mesh, "embree", ORDER, rays=REFERENCE_RAYS, seed=77)).coefficients
+        found = curve(mesh, reference, LADDER)
+        category = categories.get(path.stem, "")
+        for budget in BUDGETS:
+            spent, error = found["embree"][LADDER.index(budget)]
+            ratios[budget].append((category, at_time(found["hybrid"], spent) / error))
+        cost = 1e6 * found["hybrid"][LADDER.index(4)][0] / len(mesh.points)
+        print(f"| {path.stem} | {category} | {len(mesh.points):,} | "
+              + " | ".join(f"{ratios[b][-1][1]:.2f}" for b in BUDGETS) + f" | {cost:.1f} |", flush=True)
+    for category in sorted({c for c, _ in ratios[BUDGETS[0]]}):
+        print(f"| median | {category} | | " + " | ".join(
+            f"{statistics.median(r for c, r in ratios[b] if c == category):.2f}" for b in BUDGETS) + " | |")
+    table = Table()
+    table.heading("Hybrid at equal time", "SRR of the hybrid over Embree's in the same total time, median and worst mesh.")
+    for budget in BUDGETS:
+        values = [r for _, r in ratios[budget]]
+        table.add(f"{budget} rays, median", "", "", statistics.median(values), TARGET, most=True)
+        table.add(f"{budget} rays, worst mesh", "", "", max(values), 1.0, most=True)
+
+
+if __name__ == "__main__":
+    main()

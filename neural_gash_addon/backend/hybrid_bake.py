@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The hybrid bake: few rays from every point, then the network's mean of neighbours (`hybrid`)."""
+from __future__ import annotations
+
+import time
+from collections.abc import Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import spherical_harmonics as sh
+from .estimator import MAX_RAYS, BlockedEstimator, default_threads, morton_order
+from .geometry import TriangleMesh
+from .hybrid import Cloud, Network, filtered
+from .neighbours import neighbours
+from .progress import scaled
+from .raycast import Geometry, Occluders
+from .record import BakeRecord
+from .transfer import Transfer
+from .weights import load_hybrid
+
+FIRST_RAYS = 4        # of a bake to a tolerance; doubled until it is met
+_SAMPLE = 128         # points at which the error is measured, or a 256th of them if that is more
+_MOST_SAMPLE = 2048
+_SAMPLE_RAYS = 64     # of each of two independent traces there
+
+
+def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
+         occluders: Sequence[Geometry], seed: int, threads: int | None, scene: Occluders | None = None,
+         ) -> Generator[float, None, Transfer]:
+    """Trace `mesh` against itself and `occluders`, and take from neighbours; arguments as `methods.bake`.
+
+    With a tolerance the rays double until the measured error is within it, or they are MAX_RAYS.
+    """
+    began = time.perf_counter()
+    network = load_hybrid()
+    threads = threads or default_threads()
+    if scene is None:
+        scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
+    lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+    lit = lit[morton_order(mesh.points[lit])] if len(lit) else lit
+    last = MAX_RAYS if rays is None else rays
+    unshadowed = sh.cosine_lobe(mesh.normals, order).astype(np.float32)
+    with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+        work = _Work(mesh, scene, order, seed, last, lit, pool, threads, network, unshadowed)
+        error, used, left = None, 0, 0.9
+        blocked = np.zeros_like(unshadowed)
+        if len(lit):
+            sample = yield from scaled(work.sample(), 0, 0.1)
+        while len(lit):
+            stop = last if rays is not None else min(max(2 * used, FIRST_RAYS), last)
+            share = left if rays is not None else left / 2
+            blocked = yield from scaled(work.trace(used, stop), 1 - left, share)
+            used, left = stop, left - share
+            error = work.error(blocked, sample)
+            if used == last or (error is not None and tolerance is not None and error <= tolerance):
+                break
+    return Transfer(unshadowed - blocked, BakeRecord(
+        method="hybrid", order=order, points=len(mesh.points), domain=mesh.domain, seed=seed, rays=used * len(lit),
+        probe_rays=work.probes, seconds=time.perf_counter() - began, error_estimate=error if len(lit) else 0.0,
+        tolerance=tolerance))
+
+
+class _Work:
+    """The arrays of one bake."""
+
+    def __init__(self, mesh: TriangleMesh, scene: Occluders, order: int, seed: int, rays: int, lit: NDArray,
+                 pool: ThreadPoolExecutor, threads: int, network: Network, unshadowed: NDArray[np.float32],
+                 ) -> None:
+        self._estimator = BlockedEstimator(mesh, scene, order, seed, rays)
+        self._mesh, self._scene, self._order, self._seed = mesh, scene, order, seed
+        self._unshadowed = unshadowed
+        self._lit, self._pool, self._threads, self._network = lit, pool, threads, network
+        self._sums = np.zeros((len(lit), sh.coefficient_count(order)))
+        self._cloud: Cloud | None = None
+        self.probes = 0
+
+    def trace(self, start: int, stop: int) -> Generator[float, None, NDArray[np.float32]]:
+        """The blocked part (N, K) of all points, from directions start..stop in addition to those before."""
+        yield from self._estimator.trace(self._pool, self._threads, self._lit, start, stop, self._sums)
+        local = self._estimator.means(self._lit, self._sums, 0, stop)
+        blocked = np.zeros((len(self._mesh.points), local.shape[1]), np.float32)
+        blocked[self._lit] = self._estimator.turned(self._pool, self._lit, local)
+        if self._cloud is None:
+            self._cloud = Cloud.of(self._mesh.points, self._mesh.normals, neighbours(self._mesh), self._pool)
+        return filtered(self._cloud, blocked, self._unshadowed, stop, self._network, self._pool)
+
+    def sample(self) -> Generator[float, None, tuple[NDArray, NDArray, NDArray]]:
+        """Some points (n,), and two independent traces (n, K) of their blocked part."""
+        size = min(len(self._lit), max(_SAMPLE, min(len(self._lit) // 256, _MOST_SAMPLE)))
+        rng = np.random.default_rng([self._seed, 1])
+        points = self._lit[np.sort(rng.choice(len(self._lit), size, replace=False))]
+        few = replace(self._mesh, points=self._mesh.points[points], normals=self._mesh.normals[points],
+                      clearance=self._mesh.clearance[points])
+        rows = np.arange(size)
+        found = []
+        for number in range(2):
+            twin = BlockedEstimator(few, self._scene, self._order, int(rng.integers(2**31)), _SAMPLE_RAYS)
+            sums = np.zeros((size, sh.coefficient_count(self._order)))
+            yield from scaled(twin.trace(self._pool, self._threads, rows, 0, _SAMPLE_RAYS, sums), 0.5 * number, 0.5)
+            found.append(twin.turned(self._pool, rows, twin.means(rows, sums, 0, _SAMPLE_RAYS)))
+        self.probes = 2 * size * _SAMPLE_RAYS
+        return points, found[0], found[1]
+
+    def error(self, blocked: NDArray, sample: tuple[NDArray, NDArray, NDArray]) -> float | None:
+        """Relative L2 error at the sample. Both traces' noise is independent, so it cancels in the product."""
+        points, one, two = sample
+        squared = float(((blocked[points] - one) * (blocked[points] - two)).sum())
+        open_sky = self._unshadowed[points]
+        energy = float(((open_sky - one) * (open_sky - two)).sum())
+        return float(max(squared, 0.0) / energy) ** 0.5 if energy > 0 else None
