@@ -78,8 +78,7 @@ class Example:
     def __init__(self, path: Path) -> None:
         found = np.load(path)
         self.name = path.stem.rsplit("-", 1)[0]
-        places = found["points"]
-        self.points = (places - 0.5 * (places.min(0) + places.max(0))) / np.ptp(places, axis=0).max()
+        self.points = hybrid.normalised(found["points"]).astype(np.float32)
         self.normals = found["normals"]
         self.point = np.repeat(np.arange(len(self.points)), np.diff(found["start"]))
         self.other = found["links"].astype(np.int64)

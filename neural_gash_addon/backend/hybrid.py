@@ -51,9 +51,7 @@ class Cloud:
     @staticmethod
     def of(points: NDArray, normals: NDArray, links: Neighbours, pool: ThreadPoolExecutor) -> Cloud:
         """Points (N, 3) and unit normals (N, 3) of any size and place."""
-        low, high = points.min(0), points.max(0)
-        extent = float(np.max(high - low)) or 1.0
-        places = ((points - 0.5 * (low + high)) / extent).T.astype(np.float32)
+        places = np.ascontiguousarray(normalised(points).T, dtype=np.float32)
         shape = np.empty((4, len(links.points)), np.float32)
         turned = np.ascontiguousarray(normals.T, dtype=np.float32)
 
@@ -63,6 +61,13 @@ class Cloud:
 
         list(pool.map(part, range(0, len(points), _POINTS)))
         return Cloud(links, shape)
+
+
+def normalised(points: NDArray) -> NDArray[np.float64]:
+    """Points (N, 3) about their mean, in units of twice the distance of the farthest: the same however turned."""
+    away = points - points.mean(0)
+    extent = 2 * float(np.sqrt(np.square(away).sum(1).max(initial=0.0)))
+    return away / (extent or 1.0)
 
 
 def filtered(cloud: Cloud, blocked: NDArray[np.float32], unshadowed: NDArray[np.float32], rays: int, network: Network,
@@ -130,7 +135,7 @@ def pair_shape(points: NDArray[np.float32], normals: NDArray[np.float32], point:
     """(4, L) of pairs of points: cosine of their normals, height of each over the other's plane, distance (log).
 
     Args:
-        points, normals: (3, N), the points in units of the extent of all of them. point, other: (L,) indices.
+        points, normals: (3, N), the points `normalised`. point, other: (L,) indices.
     """
     away = [axis.take(other) - axis.take(point) for axis in points]
     one, two = [axis.take(point) for axis in normals], [axis.take(other) for axis in normals]

@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The hybrid bake: equivariance, its limit, its measured error, neighbours, and its slow twin."""
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from neural_gash_addon.backend import hybrid, methods, metrics, texture, weights
+from neural_gash_addon.backend import spherical_harmonics as sh
+from neural_gash_addon.backend.errors import UserError
+from neural_gash_addon.backend.geometry import TriangleMesh
+from neural_gash_addon.backend.neighbours import Neighbours, neighbours
+
+from . import shapes
+from .test_texture import lookup, surface
+
+
+def knot():
+    """A mesh that shadows itself."""
+    t = np.linspace(0, 2 * np.pi, 220, endpoint=False)
+    a = np.linspace(0, 2 * np.pi, 18, endpoint=False)
+    spine = np.stack([(2 + np.cos(3 * t)) * np.cos(2 * t), (2 + np.cos(3 * t)) * np.sin(2 * t), np.sin(3 * t)], 1)
+    tangent = np.roll(spine, -1, 0) - np.roll(spine, 1, 0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    side = np.cross(tangent, [0.0, 0.0, 1.0])
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    up = np.cross(side, tangent)
+    ring = np.cos(a)[None, :, None] * side[:, None] + np.sin(a)[None, :, None] * up[:, None]
+    positions = (spine[:, None] + 0.55 * ring).reshape(-1, 3)
+    i, j = (g.ravel() for g in np.meshgrid(np.arange(220), np.arange(18), indexing="ij"))
+    p = [((i + di) % 220) * 18 + (j + dj) % 18 for di, dj in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    triangles = np.concatenate([np.stack([p[0], p[1], p[2]], 1), np.stack([p[0], p[2], p[3]], 1)])
+    mesh = TriangleMesh.from_triangles(positions, triangles)
+    outward = np.einsum("nx,nx->n", mesh.normals, (positions - np.repeat(spine, 18, 0))).mean() > 0
+    return mesh if outward else TriangleMesh.from_triangles(positions, triangles[:, ::-1])
+
+
+@pytest.fixture(scope="module")
+def case():
+    """A mesh, its unshadowed transfer, and its transfer with many rays."""
+    mesh = knot()
+    return mesh, sh.cosine_lobe(mesh.normals, 3), bake(mesh, "embree", 2048, seed=5).coefficients
+
+
+def bake(mesh, method="hybrid", rays=8, order=3, **settings):
+    return methods.run(methods.bake(mesh, method, order, rays=rays, **settings))
+
+
+def slowly(mesh, links, blocked, rays, network):
+    """`hybrid.filtered`, point by point and neighbour by neighbour, as its docstring says."""
+    lobe = sh.cosine_lobe(mesh.normals, sh.order_of(blocked.shape[1]))
+    order = sh.order_of(blocked.shape[1])
+    extent = 2 * np.linalg.norm(mesh.points - mesh.points.mean(0), axis=1).max()
+    now = blocked.astype(float).copy()
+    now[:, 1:] -= now[:, :1] * lobe[:, 1:] / lobe[:, :1]
+    for layers in network:
+        out = now.copy()
+        for i in range(len(now)):
+            sums, totals = now[i].copy(), np.ones(order)
+            for j in links.points[links.start[i]:links.start[i + 1]]:
+                if now[i, 0] == 0 and now[j, 0] == 0:
+                    continue
+                away = (mesh.points[j] - mesh.points[i]) / extent
+                d = np.linalg.norm(away)
+                ni, nj = mesh.normals[i], mesh.normals[j]
+                gap = now[i, :4] - now[j, :4]
+                x = np.array([ni @ nj, ni @ away / d, -nj @ away / d, 0.5 * np.log(d), 0.5 * np.log(rays),
+                              0.25 * np.log(gap[0] ** 2 + 1e-5), 0.25 * np.log((gap[1:] ** 2).sum() + 1e-5),
+                              4 * now[i, 0], 4 * now[j, 0]])
+                for number, layer in enumerate(layers):
+                    x = x @ layer.weight + layer.bias
+                    x = np.maximum(x, 0) if number + 1 < len(layers) else x
+                w = np.exp(np.clip(x, -12, 4))[:order] * 64 / (64 + rays)
+                totals += w
+                sums += np.repeat(w, 2 * np.arange(order) + 1) * now[j]
+            out[i] = sums / np.repeat(totals, 2 * np.arange(order) + 1)
+        now = out
+    now[:, 1:] += now[:, :1] * lobe[:, 1:] / lobe[:, :1]
+    return now
+
+
+def test_equals_its_slow_twin():
+    mesh = TriangleMesh.from_triangles(*shapes.torus())
+    links, lobe = neighbours(mesh), sh.cosine_lobe(mesh.normals, 3)
+    blocked = (lobe - bake(mesh, "embree", 4).coefficients).astype(np.float32)
+    network = weights.load_hybrid()
+    with ThreadPoolExecutor(2) as pool:
+        cloud = hybrid.Cloud.of(mesh.points, mesh.normals, links, pool)
+        found = hybrid.filtered(cloud, blocked, lobe.astype(np.float32), 4, network, pool)
+    np.testing.assert_allclose(found, slowly(mesh, links, blocked, 4, network), atol=2e-5)
+    assert np.abs(found - blocked).max() > 0.01
+
+
+@pytest.mark.parametrize(("rays", "factor"), [(2, 0.35), (8, 0.4), (32, 0.6)])
+def test_takes_most_of_the_noise_away(case, rays, factor):
+    mesh, unshadowed, truth = case
+    plain, better = (metrics.srr(bake(mesh, m, rays).coefficients, truth, unshadowed) for m in ("embree", "hybrid"))
+    assert better < factor * plain
+
+
+def test_with_many_rays_the_traced_value_stays(case):
+    mesh, unshadowed, truth = case
+    for order in (2, 5):
+        plain, better = (bake(mesh, m, 4096, order).coefficients for m in ("embree", "hybrid"))
+        assert metrics.rel_l2(better, plain) < 0.004
+    few, many = (metrics.rel_l2(bake(mesh, "hybrid", r).coefficients, truth) for r in (16, 1024))
+    assert many < 0.25 * few
+
+
+def test_turning_the_mesh_turns_the_answer(case):
+    mesh, _, _ = case
+    q, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
+    q *= np.sign(np.linalg.det(q))
+    links, lobe = neighbours(mesh), sh.cosine_lobe(mesh.normals, 4)
+    blocked = lobe - bake(mesh, "embree", 4, 4).coefficients
+    network = weights.load_hybrid()
+    with ThreadPoolExecutor(2) as pool:
+        def run(points, normals, values, unshadowed):
+            cloud = hybrid.Cloud.of(points, normals, links, pool)
+            return hybrid.filtered(cloud, values.astype(np.float32), unshadowed.astype(np.float32), 4, network, pool)
+        straight = run(mesh.points, mesh.normals, blocked, lobe)
+        turned = run(5 * mesh.points @ q.T + 100, mesh.normals @ q.T, _each_turned(blocked, q),
+                     sh.cosine_lobe(mesh.normals @ q.T, 4))
+    np.testing.assert_allclose(turned, _each_turned(straight, q), atol=1e-4)
+
+
+def _each_turned(values, rotation):
+    return sh.rotate_each(values, np.broadcast_to(rotation, (len(values), 3, 3)))
+
+
+def test_convex_shapes_are_exact_and_all_blocked_is_exact():
+    ball = TriangleMesh.from_triangles(*shapes.sphere())
+    found = bake(ball, rays=2)
+    np.testing.assert_allclose(found.coefficients, sh.cosine_lobe(ball.normals, 3), atol=1e-6)
+    assert found.record.error_estimate == 0
+    inside = TriangleMesh.from_triangles(ball.positions, ball.triangles[:, ::-1])  # seen from within: no sky at all
+    assert np.abs(bake(inside, rays=2).coefficients).max() < 1e-4
+
+
+def test_threads_and_the_order_of_points_do_not_matter(case):
+    mesh, _, _ = case
+    one, two = (bake(mesh, rays=4, threads=t).coefficients for t in (1, 2))
+    np.testing.assert_allclose(one, two, atol=1e-5)
+    links, lobe = neighbours(mesh), sh.cosine_lobe(mesh.normals, 3).astype(np.float32)
+    blocked = lobe - bake(mesh, "embree", 4).coefficients
+    shuffle = np.random.default_rng(0).permutation(len(mesh.points))
+    place = np.argsort(shuffle)
+    other = TriangleMesh.from_triangles(mesh.positions[shuffle], place[mesh.triangles])
+    network = weights.load_hybrid()
+    with ThreadPoolExecutor(1) as pool:
+        def run(m, chain, values, unshadowed):
+            return hybrid.filtered(hybrid.Cloud.of(m.points, m.normals, chain, pool), values, unshadowed, 4, network, pool)
+        first = run(mesh, links, blocked, lobe)
+        second = run(other, neighbours(other), blocked[shuffle], lobe[shuffle])
+    np.testing.assert_allclose(second, first[shuffle], atol=1e-5)
+
+
+def test_error_is_measured_and_a_tolerance_is_met(case):
+    mesh, _, truth = case
+    for seed in range(3):
+        found = bake(mesh, rays=8, seed=seed)
+        true = metrics.rel_l2(found.coefficients, truth)
+        assert 0.6 < found.record.error_estimate / true < 1.5
+    for tolerance in (0.1, 0.03):
+        met = methods.run(methods.bake(mesh, "hybrid", 3, tolerance=tolerance))
+        assert metrics.rel_l2(met.coefficients, truth) < 1.4 * tolerance
+    easy, hard = (methods.run(methods.bake(mesh, "hybrid", 3, tolerance=t)).record.rays for t in (0.1, 0.02))
+    assert easy < hard
+
+
+def test_texels_learn_from_the_grid():
+    mesh = surface(shapes.torus())
+    truth = methods.run(texture.bake(mesh, "embree", 3, side=64, rays=1024, seed=8))
+    found = {m: methods.run(texture.bake(mesh, m, 3, uv=truth.uv, side=64, rays=4)) for m in ("embree", "hybrid")}
+    uv = np.random.default_rng(0).uniform(0.1, 0.9, (500, 2))
+    error = {m: metrics.rel_l2(lookup(f, uv), lookup(truth, uv)) for m, f in found.items()}
+    assert error["hybrid"] < 0.6 * error["embree"]
+
+
+def test_split_normals_learn_within_their_faces():
+    mesh = TriangleMesh.from_triangles(*shapes.torus(), smooth=False)
+    assert mesh.domain == "CORNER"
+    links = neighbours(mesh)
+    point = np.repeat(np.arange(len(mesh.points)), np.diff(links.start))
+    assert len(links.points) and (links.points != point).all()
+    assert (np.einsum("nx,nx->n", mesh.normals[point], mesh.normals[links.points]) > 0.99).all()
+    assert np.isfinite(bake(mesh, rays=2).coefficients).all()
+
+
+def test_neighbours_are_the_edges_of_the_mesh():
+    positions, triangles = shapes.sphere()
+    links = neighbours(TriangleMesh.from_triangles(positions, triangles))
+    for vertex in (0, 17, len(positions) - 1):
+        sides = triangles[(triangles == vertex).any(1)]
+        assert set(links.points[links.start[vertex]:links.start[vertex + 1]]) == set(sides.ravel()) - {vertex}
+
+
+@pytest.mark.parametrize("positions", [
+    [(0, 0, 0), (1, 0, 0), (0, 1, 0)],                                      # one triangle
+    [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 0), (5, 5, 5)],                # duplicate and isolated points
+    [(0, 0, 0), (1e-30, 0, 0), (0, 1e-30, 0)], [(1e9, 0, 0), (1e9 + 256, 0, 0), (1e9, 256, 0)]])
+def test_odd_meshes_give_finite_answers(positions):
+    triangles = [(0, 1, 2)] if len(positions) < 5 else [(0, 1, 2), (3, 2, 1)]
+    mesh = TriangleMesh.from_triangles(np.array(positions, float), np.array(triangles))
+    assert np.isfinite(bake(mesh, rays=2).coefficients).all()
+
+
+def test_points_in_one_place_give_finite_answers():
+    network = weights.load_hybrid()
+    same, up = np.zeros((3, 3)), np.tile([0.0, 0.0, 1.0], (3, 1))
+    links = Neighbours(np.array([0, 2, 4, 6]), np.array([1, 2, 0, 2, 0, 1], np.int32))
+    lobe = sh.cosine_lobe(up, 3).astype(np.float32)
+    with ThreadPoolExecutor(1) as pool:
+        found = hybrid.filtered(hybrid.Cloud.of(same, up, links, pool), lobe * [[0.1], [0.5], [0.9]], lobe, 2, network,
+                                pool)
+    assert np.isfinite(found).all()
+
+
+@pytest.mark.parametrize("harm", ["missing", "cut", "altered", "no checksum"])
+def test_weights_that_are_not_the_trained_ones_are_refused_by_name(tmp_path, harm):
+    path = tmp_path / weights.HYBRID
+    weights.save_hybrid(path, weights.load_hybrid())
+    assert all(np.array_equal(a.weight, b.weight) for one, two in zip(
+        weights.load_hybrid(path), weights.load_hybrid(), strict=True) for a, b in zip(one, two, strict=True))
+    data = path.read_bytes()
+    if harm == "missing":
+        path.unlink()
+    elif harm == "cut":
+        path.write_bytes(data[:-5])
+    elif harm == "altered":
+        path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    else:
+        (tmp_path / weights.CHECKSUMS).unlink()
+    with pytest.raises(UserError, match="hybrid.safetensors"):
+        weights.load(path)
+
+
+def test_equals_the_torch_module_that_trained_it(case):
+    torch = pytest.importorskip("torch", reason="needs torch, which only training does")
+    from training.hybrid import Filter
+    mesh, unshadowed, _ = case
+    model = Filter()
+    with torch.no_grad():
+        for module, layers in zip(model.passes, weights.load_hybrid(), strict=True):
+            for linear, layer in zip((m for m in module if hasattr(m, "weight")), layers, strict=True):
+                linear.weight.copy_(torch.from_numpy(layer.weight.T.copy()))
+                linear.bias.copy_(torch.from_numpy(layer.bias.copy()))
+        links = neighbours(mesh)
+        blocked = (unshadowed - bake(mesh, "embree", 4).coefficients).astype(np.float32)
+        points = hybrid.normalised(mesh.points).astype(np.float32)
+        point = np.repeat(np.arange(len(points)), np.diff(links.start))
+        expected = model(*(torch.from_numpy(np.ascontiguousarray(a)) for a in (
+            points, mesh.normals.astype(np.float32), point, links.points.astype(np.int64), blocked,
+            unshadowed.astype(np.float32))), 4)[-1].numpy()
+    with ThreadPoolExecutor(2) as pool:
+        cloud = hybrid.Cloud.of(mesh.points, mesh.normals, links, pool)
+        found = hybrid.filtered(cloud, blocked, unshadowed.astype(np.float32), 4, model.network(), pool)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
