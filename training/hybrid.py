@@ -164,7 +164,7 @@ def main() -> None:
     parser.add_argument("--hidden", type=int, default=HIDDEN)
     parser.add_argument("--out", type=Path, default=weights.FOLDER, help="folder of the weights")
     arguments = parser.parse_args()
-    torch.set_num_threads(2)
+    torch.set_num_threads(1)  # steps are small: a second thread gains a third, and loses tenfold where it must wait
     paths = sorted(hybrid_data.CACHE.glob("*.npz"))
     examples = [Example(path) for path in paths]
     held = examples[::HELD_OUT]
