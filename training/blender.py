@@ -14,7 +14,8 @@ UNION, DIFFERENCE, INTERSECT = "UNION", "DIFFERENCE", "INTERSECT"
 
 def primitive(kind: str, **settings: Any) -> Mesh:
     """The result of `bmesh.ops.create_<kind>`: 'monkey', 'cube', 'uvsphere', 'icosphere', 'cone', 'grid'."""
-    import bmesh
+    import bpy  # noqa: F401  (bmesh comes with it)
+    import bmesh  # isort: skip
 
     shape = bmesh.new()
     try:
@@ -28,8 +29,8 @@ def primitive(kind: str, **settings: Any) -> Mesh:
 
 def suzanne(subdivisions: int) -> Mesh:
     """Blender's monkey, 507 vertices before it is subdivided (Catmull-Clark)."""
-    import bmesh
     import bpy
+    import bmesh  # isort: skip
 
     data = bpy.data.meshes.new("training")
     shape = bmesh.new()

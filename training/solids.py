@@ -213,9 +213,12 @@ def to_size(mesh: Mesh, target: int) -> Mesh:
     if len(mesh[0]) >= target:
         return mesh
     # Equilateral triangles of edge e: V = F/2 of them cover 2V e^2 sqrt(3)/4. Halving leaves edges from
-    # half the limit to the limit, hence the factor; it is measured, and the spread is wanted.
+    # half the limit to the limit, and slivers; so look what came, and once more.
     longest = 1.55 * np.sqrt(area(mesh) / (0.866 * target))
-    return refine(mesh, float(longest))
+    fine = refine(mesh, float(longest))
+    if 0.75 * target < len(fine[0]) < 1.35 * target:
+        return fine
+    return refine(mesh, float(longest * np.sqrt(len(fine[0]) / target)))
 
 
 def ripples(rng: np.random.Generator, wavelength: float, waves: int = 24) -> tuple[NDArray, NDArray]:
