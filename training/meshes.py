@@ -17,7 +17,7 @@ from .solids import Mesh, about, place, tidy, to_size
 
 VERSION = 1              # raised whenever a seed gives another mesh, so that labels of old ones are not used
 FEWEST, MOST = 500, 20_000
-_MEDIAN, _SPREAD = 4300, 0.75  # of the log-normal number of vertices aimed at; its mean is about 5,000
+_MEDIAN, _SPREAD = 3700, 0.75  # of the log-normal number of vertices aimed at; the mean that comes is about 5,000
 _COARSE = 0.2            # of the meshes keep the long thin triangles that they were built with, where they have any
 _CREASED = 0.35          # of the meshes are shaded with creases at sharp edges, the others smooth all over
 _ATTEMPTS = 20

@@ -39,7 +39,8 @@ def any_primitive(rng: Rng, size: float = 1.0) -> Mesh:
     if kind == "cube":
         shape = blender.primitive("cube", size=1.2)
     elif kind == "uvsphere":
-        shape = blender.primitive("uvsphere", u_segments=max(sections, 12), v_segments=max(sections // 2, 8), radius=0.7)
+        shape = blender.primitive("uvsphere", u_segments=max(sections, 12), v_segments=max(sections // 2, 8),
+                                  radius=0.7)
     elif kind == "icosphere":
         shape = blender.primitive("icosphere", subdivisions=int(rng.integers(1, 5)), radius=0.7)
     elif kind == "torus":

@@ -31,7 +31,8 @@ def blobs(rng: Rng, target: int) -> Mesh:
 
 def hollow(rng: Rng, target: int) -> Mesh:
     """A lump with cavities and tunnels cut into it: bones, caves, chambers of a heart."""
-    whole = union([ellipsoid(0.5 * d, rng.uniform(0.6, 1.0, 3)) for d in _directions(rng, int(rng.integers(1, 4)))], 0.1)
+    lobes = _directions(rng, int(rng.integers(1, 4)))
+    whole = union([ellipsoid(0.5 * d, rng.uniform(0.6, 1.0, 3)) for d in lobes], 0.1)
     for d in _directions(rng, int(rng.integers(2, 8))):
         depth = rng.uniform(-0.3, 0.9)
         hole = (ellipsoid(1.1 * d, rng.uniform(0.3, 0.6)) if rng.random() < 0.4
@@ -57,7 +58,9 @@ def porous(rng: Rng, target: int) -> Mesh:
             value = np.cos(q).sum(1)
         return 0.15 * cell * (np.abs(value) - wall)
 
-    hull = ellipsoid((0, 0, 0), rng.uniform(0.8, 1.1, 3)) if rng.random() < 0.6 else slab((0, 0, 0), (0.9, 0.9, 0.7), 0.05)
+    hull = ellipsoid((0, 0, 0), rng.uniform(0.8, 1.1, 3))
+    if rng.random() < 0.4:
+        hull = slab((0, 0, 0), (0.9, 0.9, 0.7), 0.05)
     return surface(lambda p: np.maximum(lattice(p), hull(p)), np.full(3, -1.2), np.full(3, 1.2), max(target, 3000))
 
 

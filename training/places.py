@@ -37,7 +37,8 @@ def plates(rng: Rng, target: int) -> Mesh:
     for k in range(count):
         at = 2 * (k + 0.5) / count - 1
         if kind == "parallel":
-            parts.append(place(box((2, 2 * side, thick)), (*rng.uniform(-0.2, 0.2, 2), at), about("z", rng.normal() / 9)))
+            shift = rng.uniform(-0.2, 0.2, 2)
+            parts.append(place(box((2, 2 * side, thick)), (*shift, at), about("z", rng.normal() / 9)))
         elif kind == "louvre":
             parts.append(place(box((2, 2.2 / count, thick)), (0, at, 0), about("x", rng.uniform(0.3, 1.2))))
         elif kind == "crate":
