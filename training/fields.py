@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from .solids import Mesh, tidy
 
 Field = Callable[[NDArray], NDArray]
-_FIRST = 28           # cells along the longest side of the grid that counts how many are needed
-_MOST = 110           # and of the grid that is used: a million values, a second
+_FIRST = 28           # cells along the longest side of the grid that finds the surface and how fine a one it needs
+_MOST = 150           # and of the grid that is used: some millions of values
+_BLOCK = 4            # cells along a side of the blocks that are left out where they are far from the surface
 
 
 def ellipsoid(centre: Sequence[float] | NDArray, radii: Sequence[float] | NDArray) -> Field:
@@ -66,17 +67,31 @@ def surface(field: Field, low: NDArray, high: NDArray, target: int) -> Mesh:
     """The zero surface inside a box, closed at its sides, with about `target` vertices."""
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     side = float((high - low).max())
+    step = side / _FIRST
+    found = _nets(*_sampled(field, low, high, step))[0]
+    if not len(found):
+        return found, np.zeros((0, 3), np.int32)
+    low, high = np.maximum(low, found.min(0) - 1.5 * step), np.minimum(high, found.max(0) + 1.5 * step)
     # cells that a surface crosses grow with the square of the resolution
-    crossed = len(_nets(*_sampled(field, low, high, side / _FIRST))[0])
-    cells = _FIRST * np.sqrt(target / max(crossed, 1))
-    return _nets(*_sampled(field, low, high, side / float(np.clip(cells, 8, _MOST))))
+    step = max(step * np.sqrt(len(found) / target), float((high - low).max()) / _MOST)
+    return _nets(*_sampled(field, low, high, step))
 
 
 def _sampled(field: Field, low: NDArray, high: NDArray, step: float) -> tuple[NDArray, NDArray, float]:
     """Values on a grid one cell wider than the box, positive on its hull; where it starts; its step."""
-    lines = [np.arange(a - step, b + 2 * step, step) for a, b in zip(low, high, strict=True)]
-    points = np.stack(np.meshgrid(*lines, indexing="ij"), -1)
-    values = field(points.reshape(-1, 3)).reshape(points.shape[:3])
+    counts = np.ceil((high - low) / step).astype(int) + 3
+    blocks = -(-counts // _BLOCK)
+    centres = low - step + step * (_BLOCK * np.indices(blocks).reshape(3, -1).T + (_BLOCK - 1) / 2)
+    coarse = field(centres)
+    values = coarse.reshape(blocks)
+    for axis in range(3):
+        values = values.repeat(_BLOCK, axis)
+    # the values inside a block differ from its centre's by no more than half its diagonal (and some, as not
+    # all fields are exact distances); only where the sign may change must they be known
+    near = np.argwhere((np.abs(coarse) < 1.3 * np.sqrt(3) / 2 * _BLOCK * step).reshape(blocks))
+    at = (_BLOCK * near[:, None] + np.indices((_BLOCK,) * 3).reshape(3, -1).T).reshape(-1, 3)
+    values[tuple(at.T)] = field(low - step + step * at)
+    values = values[:counts[0], :counts[1], :counts[2]]
     for axis in range(3):
         edge = np.moveaxis(values, axis, 0)  # a view
         edge[0] = np.maximum(edge[0], step / 2)

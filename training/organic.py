@@ -33,7 +33,7 @@ def hollow(rng: Rng, target: int) -> Mesh:
     """A lump with cavities and tunnels cut into it: bones, caves, chambers of a heart."""
     lobes = _directions(rng, int(rng.integers(1, 4)))
     whole = union([ellipsoid(0.5 * d, rng.uniform(0.6, 1.0, 3)) for d in lobes], 0.1)
-    for d in _directions(rng, int(rng.integers(2, 8))):
+    for d in _directions(rng, int(rng.integers(3, 10))):
         depth = rng.uniform(-0.3, 0.9)
         hole = (ellipsoid(1.1 * d, rng.uniform(0.3, 0.6)) if rng.random() < 0.4
                 else capsule(1.8 * d, depth * d, rng.uniform(0.1, 0.35), rng.uniform(0.1, 0.4)))
@@ -51,12 +51,12 @@ def porous(rng: Rng, target: int) -> Mesh:
     def lattice(p: NDArray) -> NDArray:
         q = 2 * np.pi * p / cell
         if kind == "sponge":
-            return 0.12 * (noise(p, field) + 0.2)
+            return 0.06 * (noise(p, field) + 0.2)
         if kind == "gyroid":
             value = (np.sin(q) * np.cos(np.roll(q, -1, 1))).sum(1)
         else:
             value = np.cos(q).sum(1)
-        return 0.15 * cell * (np.abs(value) - wall)
+        return 0.1 * cell * (np.abs(value) - wall)
 
     hull = ellipsoid((0, 0, 0), rng.uniform(0.8, 1.1, 3))
     if rng.random() < 0.4:

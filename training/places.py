@@ -156,12 +156,12 @@ def room(rng: Rng, target: int) -> Mesh:
     """A room seen from inside: a box open in front, above or by a window, and furniture."""
     x, y, z = rng.uniform(1.8, 4, 2).tolist() + [rng.uniform(2, 3)]
     corners = np.array([(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]) * [x, y, z] - [x / 2, y / 2, 0]
+    # counter-clockwise, seen from inside
     walls = {"floor": (0, 4, 6, 2), "back": (2, 6, 7, 3), "left": (0, 2, 3, 1), "right": (4, 5, 7, 6),
              "ceiling": (1, 3, 7, 5), "front": (0, 1, 5, 4)}
     away = rng.choice(["front", "ceiling", "both", "window"])
     left_out = {"both": ("front", "ceiling"), "window": ("left",)}.get(str(away), (str(away),))
-    shell = merge([grid(corners[list(w)][[[0, 1], [3, 2]]]) for name, w in walls.items() if name not in left_out])
-    shell = (shell[0], shell[1][:, ::-1])  # the quads' halves come clockwise seen from inside
+    shell = merge([grid(corners[list(w)][[[0, 3], [1, 2]]]) for name, w in walls.items() if name not in left_out])
     parts = [to_size(shell, target // 3)]
     if away == "window":  # the left wall in four pieces around a hole
         parts += [box((0.1, y, z / 3), (-x / 2 - 0.05, 0, z / 6)), box((0.1, y, z / 5), (-x / 2 - 0.05, 0, 0.9 * z)),

@@ -80,13 +80,16 @@ def tidy(mesh: Mesh) -> Mesh:
 # --- shapes ---
 
 def grid(rows: NDArray, around: bool = False, along: bool = False) -> Mesh:
-    """Quads, halved, between rows of points (R, C, 3); `along` closes the rows' order, `around` each row."""
+    """Quads, halved, between rows of points (R, C, 3); `along` closes the rows' order, `around` each row.
+
+    They are seen from where (next row) x (next column) points.
+    """
     count, columns = rows.shape[:2]
     i, j = np.meshgrid(np.arange(count if along else count - 1), np.arange(columns if around else columns - 1),
                        indexing="ij")
     i, j, below, beside = i.ravel(), j.ravel(), (i.ravel() + 1) % count, (j.ravel() + 1) % columns
     a, b, c, d = i * columns + j, i * columns + beside, below * columns + beside, below * columns + j
-    triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    triangles = np.concatenate([np.stack([a, c, b], 1), np.stack([a, d, c], 1)])
     return rows.reshape(-1, 3).astype(np.float64), triangles.astype(np.int32)
 
 
