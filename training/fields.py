@@ -58,9 +58,14 @@ def union(parts: Sequence[Field], blend: float = 0.0) -> Field:
     return field
 
 
-def without(whole: Field, hole: Field) -> Field:
-    """What is in the first and not in the second."""
-    return lambda p: np.maximum(whole(p), -hole(p))
+def common(first: Field, second: Field, blend: float) -> Field:
+    """What is in both. The edges between are rounded, as thin ones would come out ragged."""
+    return lambda p: blend * np.logaddexp(first(p) / blend, second(p) / blend)
+
+
+def without(whole: Field, hole: Field, blend: float) -> Field:
+    """What is in the first and not in the second; see `common`."""
+    return common(whole, lambda p: -hole(p), blend)
 
 
 def surface(field: Field, low: NDArray, high: NDArray, target: int) -> Mesh:

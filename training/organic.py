@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from .fields import Field, capsule, ellipsoid, slab, surface, union, without
+from .fields import Field, capsule, common, ellipsoid, slab, surface, union, without
 from .objects import Rng, any_primitive
 from .solids import Mesh, about, ball, box, grid, merge, noise, place, ripples, swept, to_size, torus
 
@@ -33,11 +33,12 @@ def hollow(rng: Rng, target: int) -> Mesh:
     """A lump with cavities and tunnels cut into it: bones, caves, chambers of a heart."""
     lobes = _directions(rng, int(rng.integers(1, 4)))
     whole = union([ellipsoid(0.5 * d, rng.uniform(0.6, 1.0, 3)) for d in lobes], 0.1)
+    rounding = rng.uniform(0.015, 0.05)
     for d in _directions(rng, int(rng.integers(3, 10))):
         depth = rng.uniform(-0.3, 0.9)
         hole = (ellipsoid(1.1 * d, rng.uniform(0.3, 0.6)) if rng.random() < 0.4
                 else capsule(1.8 * d, depth * d, rng.uniform(0.1, 0.35), rng.uniform(0.1, 0.4)))
-        whole = without(whole, hole)
+        whole = without(whole, hole, rounding)
     return surface(whole, np.full(3, -1.7), np.full(3, 1.7), target)
 
 
@@ -61,7 +62,7 @@ def porous(rng: Rng, target: int) -> Mesh:
     hull = ellipsoid((0, 0, 0), rng.uniform(0.8, 1.1, 3))
     if rng.random() < 0.4:
         hull = slab((0, 0, 0), (0.9, 0.9, 0.7), 0.05)
-    return surface(lambda p: np.maximum(lattice(p), hull(p)), np.full(3, -1.2), np.full(3, 1.2), max(target, 3000))
+    return surface(common(lattice, hull, 0.02), np.full(3, -1.2), np.full(3, 1.2), max(target, 3000))
 
 
 def figure(rng: Rng, target: int) -> Mesh:
@@ -82,7 +83,7 @@ def figure(rng: Rng, target: int) -> Mesh:
              ellipsoid(high + (body + 0.25) * np.array([0, 0.4 if four else 0, 1]), rng.uniform(0.2, 0.35, 3))]
     for side in (-1, 1):
         out = np.array([side, 0, 0])
-        leg = rng.uniform(0.7, 1.2), rng.uniform(0.1, 0.17)
+        leg = rng.uniform(0.9, 1.5), rng.uniform(0.1, 0.17)
         if four:
             parts += limb(low + 0.7 * body * out, np.array([0.2 * side, 0, -1]), *leg)
             parts += limb(high + 0.7 * body * out, np.array([0.2 * side, 0, -1]), *leg)
@@ -136,7 +137,7 @@ def tree(rng: Rng, target: int) -> Mesh:
 
 def vessels(rng: Rng, target: int) -> Mesh:
     """Branching tubes as one skin with fillets: blood vessels, corals, antlers."""
-    found = _branches(rng, np.zeros(3), np.array([0, 0, 1.0]), 1.0, rng.uniform(0.12, 0.2), 2)
+    found = _branches(rng, np.zeros(3), np.array([0, 0, 1.0]), 1.0, rng.uniform(0.12, 0.2), 3)
     parts = [capsule(spine[k], spine[k + 3], radii[k], radii[k + 3]) for spine, radii in found for k in (0, 3, 6)]
     parts += [capsule(spine[9], spine[10], radii[9], radii[10]) for spine, radii in found]
     ends = np.concatenate([spine for spine, _ in found])
@@ -207,7 +208,7 @@ def cloth(rng: Rng, target: int) -> Mesh:
         radius = 0.25 + 0.05 * rng.uniform(0.6, 2) * angle
         return grid(np.stack([radius * np.cos(angle), radius * np.sin(angle), v * 0.9 + soft], -1))
     r = np.sqrt(u**2 + v**2)
-    below = ball(0.45, 3)
+    below = ball(0.35, 3)
     # over a ball: on it near the middle, then down in folds
     drop = -np.maximum(r - 0.5, 0) * rng.uniform(0.8, 1.6) * (1 + 0.3 * np.sin(rng.integers(4, 9) * np.arctan2(v, u)))
     height = np.where(r < 0.5, np.sqrt(np.maximum(0.5**2 - r**2, 0)), 0) + drop + 0.4 * soft
