@@ -13,7 +13,7 @@ UNION, DIFFERENCE, INTERSECT = "UNION", "DIFFERENCE", "INTERSECT"
 
 
 def primitive(kind: str, **settings: Any) -> Mesh:
-    """The result of `bmesh.ops.create_<kind>`: 'monkey', 'cube', 'uvsphere', 'icosphere', 'cone', 'grid'."""
+    """The result of `bmesh.ops.create_<kind>`: 'cube', 'icosphere', 'cone', 'monkey'."""
     import bpy  # noqa: F401  (bmesh comes with it)
     import bmesh  # isort: skip
 
@@ -21,6 +21,7 @@ def primitive(kind: str, **settings: Any) -> Mesh:
     try:
         getattr(bmesh.ops, f"create_{kind}")(shape, **settings)
         bmesh.ops.triangulate(shape, faces=shape.faces[:])
+        shape.verts.index_update()
         return (np.array([v.co for v in shape.verts], dtype=np.float64),
                 np.array([[v.index for v in f.verts] for f in shape.faces], dtype=np.int32))
     finally:

@@ -39,8 +39,10 @@ def any_primitive(rng: Rng, size: float = 1.0) -> Mesh:
     if kind == "cube":
         shape = blender.primitive("cube", size=1.2)
     elif kind == "uvsphere":
-        shape = blender.primitive("uvsphere", u_segments=max(sections, 12), v_segments=max(sections // 2, 8),
-                                  radius=0.7)
+        # by hand: the order of Blender's vertices changes from process to process
+        latitude = np.linspace(-np.pi / 2, np.pi / 2, max(sections // 2, 8) + 1)
+        profile = 0.7 * np.stack([np.cos(latitude), np.sin(latitude)], 1)
+        shape = turned(profile, max(sections, 12))
     elif kind == "icosphere":
         shape = blender.primitive("icosphere", subdivisions=int(rng.integers(1, 5)), radius=0.7)
     elif kind == "torus":

@@ -75,7 +75,7 @@ def figure(rng: Rng, target: int) -> Mesh:
                 ellipsoid(end, radius * rng.uniform(0.8, 1.3, 3))]
 
     four = rng.random() < 0.4
-    body = rng.uniform(0.25, 0.42)
+    body = rng.uniform(0.25, 0.42) * (0.75 if four else 1)
     length = rng.uniform(0.5, 1.0)
     axis = np.array([0, 1, 0.1]) if four else np.array([0, 0.1, 1])
     low, high = -length / 2 * axis, length / 2 * axis
@@ -138,10 +138,11 @@ def tree(rng: Rng, target: int) -> Mesh:
 def vessels(rng: Rng, target: int) -> Mesh:
     """Branching tubes as one skin with fillets: blood vessels, corals, antlers."""
     found = _branches(rng, np.zeros(3), np.array([0, 0, 1.0]), 1.0, rng.uniform(0.12, 0.2), 3)
-    parts = [capsule(spine[k], spine[k + 3], radii[k], radii[k + 3]) for spine, radii in found for k in (0, 3, 6)]
-    parts += [capsule(spine[9], spine[10], radii[9], radii[10]) for spine, radii in found]
+    found = [(spine, np.maximum(radii, 0.05)) for spine, radii in found]  # thinner ones would fall apart
+    parts = [capsule(spine[a], spine[b], radii[a], radii[b]) for spine, radii in found
+             for a, b in ((0, 3), (3, 6), (6, 10))]
     ends = np.concatenate([spine for spine, _ in found])
-    return surface(union(parts, 0.02), ends.min(0) - 0.3, ends.max(0) + 0.3, target)
+    return surface(union(parts, 0.012), ends.min(0) - 0.3, ends.max(0) + 0.3, max(target, 2500))
 
 
 def displaced(rng: Rng, target: int) -> Mesh:
