@@ -157,7 +157,7 @@ def _outcomes(missing: Sequence[tuple[Job, Path]], workers: int) -> Iterator[Out
         return
     # spawned, because Blender and Embree have threads that a fork would lose
     context = multiprocessing.get_context("spawn")
-    with _serial(), ProcessPoolExecutor(workers, mp_context=context) as pool:
+    with _serial(), ProcessPoolExecutor(workers, context, _forget_blender) as pool:
         futures = {pool.submit(work, job, path): job for job, path in missing}
         try:
             for future in as_completed(futures):
@@ -165,6 +165,11 @@ def _outcomes(missing: Sequence[tuple[Job, Path]], workers: int) -> Iterator[Out
                 yield outcome._replace(job=futures[future])  # the very job, not its copy from the process
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def _forget_blender() -> None:
+    """In a new process: it got the search path of its parent, and if Blender was there, folders that hide `bpy`."""
+    sys.path[:] = [p for p in sys.path if not (Path(p) / "bpy" / "__init__.py").is_file()]  # the module is a library
 
 
 @contextmanager
