@@ -20,7 +20,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -85,7 +85,7 @@ def of_folder(folder: Path, rays: int, frames: str = PLAIN_FRAMES) -> list[Job]:
 def read(path: Path) -> Mesh:
     """A mesh of a file, its corners welded: .stl has no vertices, .obj splits them at seams. Raises UserError."""
     try:
-        found = trimesh.load(path, process=False, force="mesh")
+        found: Any = trimesh.load(path, process=False, force="mesh")
         mesh = np.asarray(found.vertices, dtype=np.float64), np.asarray(found.faces, dtype=np.int32)
         whole = len(mesh[1]) > 0 and bool(np.isfinite(mesh[0]).all())
     except _UNREADABLE as error:

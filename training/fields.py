@@ -18,7 +18,7 @@ _MOST = 150           # and of the grid that is used: some millions of values
 _BLOCK = 4            # cells along a side of the blocks that are left out where they are far from the surface
 
 
-def ellipsoid(centre: Sequence[float] | NDArray, radii: Sequence[float] | NDArray) -> Field:
+def ellipsoid(centre: Sequence[float] | NDArray, radii: float | Sequence[float] | NDArray) -> Field:
     """Exact for a ball, about right near the surface of others."""
     c, r = np.asarray(centre, dtype=np.float64), np.asarray(radii, dtype=np.float64) * np.ones(3)
     return lambda p: (np.linalg.norm((p - c) / r, axis=1) - 1) * r.min()

@@ -155,4 +155,4 @@ TEXTS = ("name", "category", "record")
 def load(path: Path) -> Sample:
     """A file that `data` wrote. Raises what NumPy and zipfile raise where it is none."""
     with np.load(path, allow_pickle=False) as found:
-        return Sample(**{key: found[key] for key in ARRAYS}, **{key: str(found[key]) for key in TEXTS})
+        return Sample(**{key: found[key] if key in ARRAYS else str(found[key]) for key in (*ARRAYS, *TEXTS)})

@@ -211,7 +211,10 @@ def vessel(rng: Rng, target: int) -> Mesh:
     radius = np.maximum(radius, 0.15) * np.minimum(1, 0.3 + 6 * s)
     height, wall = rng.uniform(0.4, 2.5), rng.uniform(0.03, 0.12)
     outer = np.stack([radius, height * s], 1)
-    inner = np.stack([np.maximum(radius - wall, 0.02), wall + (height - wall) * s], 1)[::-1]
+    along = np.gradient(outer, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    inner = (outer + wall * np.stack([-along[:, 1], along[:, 0]], 1))[::-1]
+    inner[:, 0] = np.maximum(inner[:, 0], 0.02)
     outline = np.concatenate([[(0, 0)], outer, inner, [(0, wall)]])
     flutes = int(rng.integers(3, 12)) if rng.random() < 0.4 else 0
     p, t = turned(outline, int(rng.integers(24, 64)))

@@ -44,8 +44,8 @@ def hollow(rng: Rng, target: int) -> Mesh:
 
 def porous(rng: Rng, target: int) -> Mesh:
     """A ball or block of a triply periodic surface with walls, or of sponge."""
-    cell = rng.uniform(0.9, 1.8)
-    wall = rng.uniform(0.25, 0.6)
+    cell = rng.uniform(1.1, 1.8)
+    wall = rng.uniform(0.4, 0.7)  # thinner ones would come out in holes
     field = ripples(rng, 0.9, 12)
     kind = rng.choice(["gyroid", "primitive", "sponge"])
 
@@ -62,7 +62,7 @@ def porous(rng: Rng, target: int) -> Mesh:
     hull = ellipsoid((0, 0, 0), rng.uniform(0.8, 1.1, 3))
     if rng.random() < 0.4:
         hull = slab((0, 0, 0), (0.9, 0.9, 0.7), 0.05)
-    return surface(common(lattice, hull, 0.02), np.full(3, -1.2), np.full(3, 1.2), max(target, 3000))
+    return surface(common(lattice, hull, 0.02), np.full(3, -1.2), np.full(3, 1.2), max(target, 5000))
 
 
 def figure(rng: Rng, target: int) -> Mesh:
@@ -150,7 +150,7 @@ def displaced(rng: Rng, target: int) -> Mesh:
     p, t = to_size(ball(1, 4) if rng.random() < 0.5 else any_primitive(rng, 1.3), target)
     centre = p.mean(0)
     away = (p - centre) / np.maximum(np.linalg.norm(p - centre, axis=1, keepdims=True), 1e-9)
-    field, value = ripples(rng, rng.uniform(0.3, 1.4)), 0.0
+    field = ripples(rng, rng.uniform(0.3, 1.4))
     kind, depth = rng.choice(["lumps", "ridges", "craters", "spikes"]), rng.uniform(0.03, 0.14)
     value = noise(p, field)
     if kind == "ridges":

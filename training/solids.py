@@ -25,8 +25,8 @@ def merge(parts: Sequence[Mesh]) -> Mesh:
             np.concatenate([t + first for (_, t), first in zip(parts, firsts, strict=False)]).astype(np.int32))
 
 
-def place(mesh: Mesh, offset: Sequence[float] = (0, 0, 0), turn: Rotation | None = None,
-          scale: float | Sequence[float] = 1.0) -> Mesh:
+def place(mesh: Mesh, offset: Sequence[float] | NDArray = (0, 0, 0), turn: Rotation | None = None,
+          scale: float | Sequence[float] | NDArray = 1.0) -> Mesh:
     """Scaled (not mirrored), then turned, then moved."""
     p = mesh[0] * np.asarray(scale, dtype=np.float64)
     return (p if turn is None else turn.apply(p)) + np.asarray(offset, dtype=np.float64), mesh[1]
