@@ -45,7 +45,7 @@ def hollow(rng: Rng, target: int) -> Mesh:
 def porous(rng: Rng, target: int) -> Mesh:
     """A ball or block of a triply periodic surface with walls, or of sponge."""
     cell = rng.uniform(1.1, 1.8)
-    wall = rng.uniform(0.4, 0.7)  # thinner ones would come out in holes
+    wall = rng.uniform(0.5, 0.8)  # thinner ones would come out in holes
     field = ripples(rng, 0.9, 12)
     kind = rng.choice(["gyroid", "primitive", "sponge"])
 
@@ -160,7 +160,7 @@ def displaced(rng: Rng, target: int) -> Mesh:
             d = np.linalg.norm(p - c, axis=1) / rng.uniform(0.15, 0.4)
             value = value * 0.9 + np.where(d < 1.3, np.minimum(3 * d**2 - 2.5, 2 * (1.3 - d)), 0)
     elif kind == "spikes":
-        value = 3 * np.maximum(value, 0) ** 3 / 3
+        value = np.maximum(value, 0) ** 3
     return p + away * np.clip(depth * value, -0.35, 0.8)[:, None], t
 
 

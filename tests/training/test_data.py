@@ -10,7 +10,7 @@ from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.errors import UserError
 from training import data, labels, solids
 
-RAYS = 64
+RAYS = 16
 
 
 def skewed_frames(normals: np.ndarray) -> np.ndarray:
@@ -116,7 +116,7 @@ def test_a_run_goes_on_where_it_was(tmp_path):
 
 def test_other_settings_are_another_file(monkeypatch):
     job = data.generated(1, 0, RAYS)[0]
-    names = {job.file_name(), replace(job, rays=32).file_name(), replace(job, frames="a:b").file_name()}
+    names = {job.file_name(), replace(job, rays=48).file_name(), replace(job, frames="a:b").file_name()}
     for module in (data.meshes, data.labels):
         monkeypatch.setattr(module, "VERSION", module.VERSION + 1)
         names.add(job.file_name())
