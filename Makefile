@@ -2,8 +2,9 @@
 # make demo   bake a mesh, light it with an HDRI, render it; pictures go to out/
 # make test   run the tests
 # make test-window BLENDER=…   try the panel and the bake in an open Blender (see tests/window/session.py)
+# make data    label meshes to train on, in training/cache/ (COUNT=2000 SEED=1 FOLDER=… for more)
 # make lint, package, bench, docs-pictures, clean: as they say
-.PHONY: demo docs-pictures test test-window lint package bench clean system-packages
+.PHONY: data demo docs-pictures test test-window lint package bench clean system-packages
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 PY := .venv/bin/python
 # Debian's names of what bpy loads; EEVEE renders without a display through EGL and llvmpipe
@@ -46,6 +47,11 @@ package: .venv/ready
 bench: .venv/ready
 	$(PY) -m pip install --disable-pip-version-check -q -r benchmarks/requirements.txt
 	$(PY) benchmarks/bench.py
+
+COUNT ?= 2000
+SEED ?= 1
+data: .venv/ready
+	$(PY) -m training.data --count $(COUNT) --seed $(SEED) $(if $(FOLDER),--folder "$(FOLDER)")
 
 clean:
 	rm -rf .venv .venv52 build dist out .pytest_cache .mypy_cache .ruff_cache

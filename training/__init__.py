@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Data and training of the shipped weights; not part of the extension."""
+"""Training data and training of the shipped weights; not part of the extension."""

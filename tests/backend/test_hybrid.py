@@ -149,7 +149,8 @@ def test_threads_and_the_order_of_points_do_not_matter(case):
     network = weights.load_hybrid()
     with ThreadPoolExecutor(1) as pool:
         def run(m, chain, values, unshadowed):
-            return hybrid.filtered(hybrid.Cloud.of(m.points, m.normals, chain, pool), values, unshadowed, 4, network, pool)
+            cloud = hybrid.Cloud.of(m.points, m.normals, chain, pool)
+            return hybrid.filtered(cloud, values, unshadowed, 4, network, pool)
         first = run(mesh, links, blocked, lobe)
         second = run(other, neighbours(other), blocked[shuffle], lobe[shuffle])
     np.testing.assert_allclose(second, first[shuffle], atol=1e-5)
