@@ -6,14 +6,14 @@ making of the data can be stopped and goes on.
 """
 from __future__ import annotations
 
+import argparse
 import hashlib
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import trimesh
-from tqdm import tqdm
+from tqdm import tqdm, trange
 
 from neural_gash_addon.backend import methods
 from neural_gash_addon.backend import spherical_harmonics as sh
@@ -21,6 +21,8 @@ from neural_gash_addon.backend.exchange import atomic
 from neural_gash_addon.backend.geometry import TriangleMesh
 from neural_gash_addon.backend.neighbours import neighbours
 from neural_gash_addon.backend.raycast import Occluders
+
+from . import labels, meshes
 
 ORDER = 5
 RAYS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128, 256)
@@ -57,12 +59,19 @@ def make(name: str, mesh: TriangleMesh, cache: Path = CACHE) -> Path:
     return path
 
 
-def make_all(folder: Path, cache: Path = CACHE) -> Iterator[Path]:
-    """The files of all meshes of a folder."""
-    for path in tqdm(sorted(folder.glob("*.ply")), desc="tracing", unit="mesh"):
-        yield make(path.stem, load(path), cache)
+def main() -> None:
+    """`python -m training.hybrid_data`: the files of all meshes of a folder, and of some that are generated."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--folder", type=Path, default=Path(__file__).resolve().parents[2] / "shared/meshes/train")
+    parser.add_argument("--count", type=int, default=100, help="of generated meshes")
+    parser.add_argument("--seed", type=int, default=1, help="of the first of those")
+    arguments = parser.parse_args()
+    for path in tqdm(sorted(arguments.folder.glob("*.ply")), desc="tracing the folder", unit="mesh"):
+        make(path.stem, load(path))
+    for seed in trange(arguments.seed, arguments.seed + arguments.count, desc="tracing generated", unit="mesh"):
+        found = meshes.generate(seed)
+        make(f"{found.category}-{seed:06d}", labels.shaded(found.positions, found.triangles, found.crease))
 
 
 if __name__ == "__main__":
-    shared = Path(__file__).resolve().parents[2] / "shared" / "meshes"
-    list(make_all(shared / "train"))
+    main()

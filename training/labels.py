@@ -100,7 +100,8 @@ def shaded(positions: NDArray, triangles: NDArray, crease: float | None) -> Tria
     angles = np.arccos(np.clip(-(along * np.roll(along, 1, 1)).sum(-1), -1, 1)).ravel()
     weighted = np.repeat(face_normals, 3, axis=0) * angles[:, None]
     normals = unit(np.stack([np.bincount(fan, weighted[:, axis], count) for axis in range(3)], 1))[fan]
-    return TriangleMesh.from_corners(p, t, t.ravel(), normals, np.repeat(np.arange(len(t)), 3))
+    return TriangleMesh.from_corners(p, t, t.ravel(), normals, np.repeat(np.arange(len(t)), 3),
+                                     corners=np.arange(t.size, dtype=np.int32).reshape(-1, 3))
 
 
 def label(positions: NDArray, triangles: NDArray, crease: float | None, *, name: str, category: str, rays: int,
