@@ -35,8 +35,8 @@ class Filter(nn.Module):
         super().__init__()
         self.order = order
         self.passes = nn.ModuleList(
-            nn.Sequential(nn.Linear(hybrid.FEATURES, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(),
-                          nn.Linear(hidden, order)) for _ in range(passes))
+            nn.Sequential(nn.Linear(hybrid.FEATURES, hidden), nn.ReLU(), nn.Linear(hidden, order))
+            for _ in range(passes))
 
     def forward(self, points: Tensor, normals: Tensor, point: Tensor, other: Tensor, blocked: Tensor,
                 unshadowed: Tensor, rays: int) -> list[Tensor]:

@@ -32,16 +32,20 @@ _TURNED_AT_ONCE = 2048  # points rotated by one worker at a time
 class BlockedEstimator:
     """Sums of Y_k over blocked rays, in each point's local frame."""
 
-    def __init__(self, mesh: TriangleMesh, occluders: Occluders, order: int, seed: int, rays: int) -> None:
-        """rays: the most that any point will take. seed: independent seeds give independent estimates."""
+    def __init__(self, mesh: TriangleMesh, occluders: Occluders, order: int, seed: int, rays: int, sets: int = SETS
+                 ) -> None:
+        """rays: the most that any point will take. seed: independent seeds give independent estimates.
+
+        sets: fewer cost less where points are few, whose errors are then less independent.
+        """
         rng = np.random.default_rng([seed, 0])
         self._occluders = occluders
         self._order = order
-        self._sets = sampling.hemisphere_sets(SETS, rays, int(rng.integers(2**31)))
+        self._sets = sampling.hemisphere_sets(sets, rays, int(rng.integers(2**31)))
         self._origins = occluders.origins(mesh.points, mesh.clearance)
         self._normals = mesh.normals
         self._angles = rng.uniform(0, 2 * np.pi, len(mesh.points)).astype(np.float32)
-        self._set_of_point = rng.integers(0, SETS, len(mesh.points), dtype=np.uint8)
+        self._set_of_point = rng.integers(0, sets, len(mesh.points), dtype=np.uint8)
         self._excess: dict[tuple[int, int], NDArray] = {}
         self._stop = threading.Event()
 
@@ -84,8 +88,9 @@ class BlockedEstimator:
         size = max(1, RAYS_PER_JOB // (stop - start))
         set_of_row = self._set_of_point[points]
         rows_by_set = np.argsort(set_of_row, kind="stable")
-        bounds = np.searchsorted(set_of_row[rows_by_set], np.arange(SETS + 1))
-        for s in range(SETS):
+        bounds = np.searchsorted(set_of_row[rows_by_set], np.arange(len(self._sets) + 1))
+        harmonics = self._harmonics(start, stop)
+        for s in range(len(self._sets)):
             rows = rows_by_set[bounds[s]:bounds[s + 1]]
             if not len(rows):
                 continue
@@ -93,9 +98,13 @@ class BlockedEstimator:
             # (9, 3r): frame (row-major, 9) @ lift = the r directions' world coordinates in a row,
             # so that one matrix product makes the rays of many points in the layout Embree reads
             lift = np.einsum("cd,ja->cajd", np.eye(3), local).reshape(9, -1).astype(np.float32)
-            harmonics = sh.evaluate(local, self._order)
             for part in np.array_split(rows, -(-len(rows) // size)):  # even, so that no worker waits for a rest
-                yield part, (lift, harmonics)
+                yield part, (lift, harmonics[s])
+
+    def _harmonics(self, start: int, stop: int) -> NDArray[np.float64]:
+        """(sets, stop - start, K) of the directions of each set."""
+        local = self._sets[:, start:stop]
+        return sh.evaluate(local.reshape(-1, 3), self._order).reshape(*local.shape[:2], -1)
 
     def _blocked_sums(self, points: NDArray, lift: NDArray, harmonics: NDArray) -> NDArray[np.float64]:
         """Worker: (n, K) sums of Y_k over the blocked ones of these directions at these points."""
@@ -119,31 +128,39 @@ class BlockedEstimator:
         """
         if (start, stop) not in self._excess:
             exact = sh.cosine_lobe(np.array([[0.0, 0.0, 1.0]]), self._order)[0]
-            self._excess[start, stop] = np.stack([exact - sh.evaluate(local[start:stop], self._order).mean(0)
-                                                  for local in self._sets])
+            self._excess[start, stop] = exact - self._harmonics(start, stop).mean(1)
         mean = sums / (stop - start)
         share = mean[:, :1] / sh.normalisation(0, 0)  # Y_0 is constant, so this counts the blocked rays
         return mean + share * self._excess[start, stop][self._set_of_point[points]]
 
     def transfer(self, pool: ThreadPoolExecutor, points: NDArray, local: NDArray) -> NDArray[np.float64]:
         """Transfer (n, K) in the bake frame: the exact unshadowed part minus the blocked part (n, K), local."""
-        def part(start: int) -> NDArray[np.float64]:
-            here = slice(start, start + _TURNED_AT_ONCE)
-            return (sh.cosine_lobe(self._normals[points[here]], self._order)
-                    - sh.rotate_each(local[here], self._frames(points[here])))
-
-        return np.concatenate(list(pool.map(part, range(0, len(points), _TURNED_AT_ONCE))))
-
-    def turned(self, pool: ThreadPoolExecutor, points: NDArray, local: NDArray) -> NDArray[np.float32]:
-        """The blocked part (n, K) in the bake frame. Where nothing is blocked, nothing is turned."""
-        out = np.zeros(local.shape, np.float32)
-        some = np.flatnonzero(local[:, 0])
+        out = np.empty(local.shape)
 
         def part(start: int) -> None:
-            here = some[start:start + _TURNED_AT_ONCE]
-            out[here] = sh.rotate_each(local[here], self._frames(points[here]))
+            here = slice(start, start + _TURNED_AT_ONCE)
+            out[here] = sh.cosine_lobe(self._normals[points[here]], self._order)
+            out[here] -= self._turned(points[here], local[here])
 
-        list(pool.map(part, range(0, len(some), _TURNED_AT_ONCE)))
+        list(pool.map(part, range(0, len(points), _TURNED_AT_ONCE)))
+        return out
+
+    def turned(self, pool: ThreadPoolExecutor, points: NDArray, local: NDArray) -> NDArray[np.float32]:
+        """The blocked part (n, K), local, in the bake frame."""
+        out = np.empty(local.shape, np.float32)
+
+        def part(start: int) -> None:
+            here = slice(start, start + _TURNED_AT_ONCE)
+            out[here] = self._turned(points[here], local[here])
+
+        list(pool.map(part, range(0, len(points), _TURNED_AT_ONCE)))
+        return out
+
+    def _turned(self, points: NDArray, local: NDArray) -> NDArray[np.float64]:
+        """`turned` of a few points. Where nothing is blocked, nothing is turned."""
+        out = np.zeros(local.shape)
+        some = np.flatnonzero(local[:, 0])
+        out[some] = sh.rotate_each(local[some], self._frames(points[some]))
         return out
 
     def _frames(self, points: NDArray) -> NDArray[np.float64]:

@@ -26,7 +26,7 @@ FULL = 0.5 / np.pi ** 0.5  # coefficient 0 of a point of which all is blocked
 MOST, LEAST = 4.0, -12.0  # of log w
 HALF = 64.0               # rays at which weights are halved
 _TINY = 1e-5              # of a squared difference: below noise of any ray count
-_POINTS = 2048            # at a time: what is computed for their edges stays in the cache
+_POINTS = 4096            # at a time: less, and threads wait for the interpreter; more, and the cache runs over
 _BLAS_COLUMNS = 1024      # of one matrix product: small enough for BLAS to stay on the calling thread
 
 

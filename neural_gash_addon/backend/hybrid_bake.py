@@ -24,7 +24,7 @@ from .weights import load_hybrid
 FIRST_RAYS = 4        # of a bake to a tolerance; doubled until it is met
 _SAMPLE = 128         # points at which the error is measured, or a 256th of them if that is more
 _MOST_SAMPLE = 2048
-_SAMPLE_RAYS = 64     # of each of two independent traces there
+_SAMPLE_RAYS, _SAMPLE_SETS = 64, 4  # of each of two independent traces there
 
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
@@ -97,7 +97,8 @@ class _Work:
         rows = np.arange(size)
         found = []
         for number in range(2):
-            twin = BlockedEstimator(few, self._scene, self._order, int(rng.integers(2**31)), _SAMPLE_RAYS)
+            twin = BlockedEstimator(few, self._scene, self._order, int(rng.integers(2**31)), _SAMPLE_RAYS,
+                                    _SAMPLE_SETS)
             sums = np.zeros((size, sh.coefficient_count(self._order)))
             yield from scaled(twin.trace(self._pool, self._threads, rows, 0, _SAMPLE_RAYS, sums), 0.5 * number, 0.5)
             found.append(twin.turned(self._pool, rows, twin.means(rows, sums, 0, _SAMPLE_RAYS)))
