@@ -7,7 +7,7 @@ gives log w_ij from numbers that do not change when the mesh is turned, moved or
 answer turns with the mesh. Weights fall as 1 / rays, so with many rays the traced value stays.
 Where nothing was blocked in a neighbourhood, nothing is computed.
 
-The network is a multilayer perceptron of 500 numbers a pass; it runs in NumPy.
+The network is a perceptron with one hidden layer, 245 numbers a pass; it runs in NumPy.
 """
 from __future__ import annotations
 
