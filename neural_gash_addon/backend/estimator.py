@@ -83,6 +83,13 @@ class BlockedEstimator:
                 wait(pending)
                 self._stop.clear()
 
+    def summed(self, points: NDArray, start: int, stop: int) -> NDArray[np.float64]:
+        """What `trace` adds for a few points, at once and on the calling thread: (n, K)."""
+        sums = np.zeros((len(points), self._order ** 2))
+        for rows, tables in self._jobs(points, start, stop):
+            sums[rows] += self._blocked_sums(points[rows], *tables)
+        return sums
+
     def _jobs(self, points: NDArray, start: int, stop: int) -> Iterator[tuple[NDArray, tuple[NDArray, NDArray]]]:
         """Rows of `points` that share a set, with its tables for directions start..stop."""
         size = max(1, RAYS_PER_JOB // (stop - start))
@@ -140,7 +147,7 @@ class BlockedEstimator:
         def part(start: int) -> None:
             here = slice(start, start + _TURNED_AT_ONCE)
             out[here] = sh.cosine_lobe(self._normals[points[here]], self._order)
-            out[here] -= self._turned(points[here], local[here])
+            out[here] -= self.turned_here(points[here], local[here])
 
         list(pool.map(part, range(0, len(points), _TURNED_AT_ONCE)))
         return out
@@ -151,13 +158,13 @@ class BlockedEstimator:
 
         def part(start: int) -> None:
             here = slice(start, start + _TURNED_AT_ONCE)
-            out[here] = self._turned(points[here], local[here])
+            out[here] = self.turned_here(points[here], local[here])
 
         list(pool.map(part, range(0, len(points), _TURNED_AT_ONCE)))
         return out
 
-    def _turned(self, points: NDArray, local: NDArray) -> NDArray[np.float64]:
-        """`turned` of a few points. Where nothing is blocked, nothing is turned."""
+    def turned_here(self, points: NDArray, local: NDArray) -> NDArray[np.float64]:
+        """`turned` of a few points, on the calling thread. Where nothing is blocked, nothing is turned."""
         out = np.zeros(local.shape)
         some = np.flatnonzero(local[:, 0])
         out[some] = sh.rotate_each(local[some], self._frames(points[some]))

@@ -26,7 +26,7 @@ FULL = 0.5 / np.pi ** 0.5  # coefficient 0 of a point of which all is blocked
 MOST, LEAST = 4.0, -12.0  # of log w
 HALF = 64.0               # rays at which weights are halved
 _TINY = 1e-5              # of a squared difference: below noise of any ray count
-_POINTS = 4096            # at a time: less, and threads wait for the interpreter; more, and the cache runs over
+_MOST_POINTS = 4096            # at a time: less, and threads wait for the interpreter; more, and the cache runs over
 _BLAS_COLUMNS = 1024      # of one matrix product: small enough for BLAS to stay on the calling thread
 
 
@@ -55,11 +55,13 @@ class Cloud:
         shape = np.empty((4, len(links.points)), np.float32)
         turned = np.ascontiguousarray(normals.T, dtype=np.float32)
 
+        step = _step(len(points))
+
         def part(start: int) -> None:
-            point, other, edges = _pairs(links, start, min(start + _POINTS, len(points)))
+            point, other, edges = _pairs(links, start, min(start + step, len(points)))
             shape[:, edges] = pair_shape(places, turned, point, other)
 
-        list(pool.map(part, range(0, len(points), _POINTS)))
+        list(pool.map(part, range(0, len(points), step)))
         return Cloud(links, shape)
 
 
@@ -87,18 +89,24 @@ def filtered(cloud: Cloud, blocked: NDArray[np.float32], unshadowed: NDArray[np.
     even = np.ascontiguousarray(unshadowed.T[1:], dtype=np.float32) / np.float32(FULL)
     now = np.array(blocked.T, dtype=np.float32, order="C")  # by coefficient: what is beside in memory is alike
     now[1:] -= now[0] * even
+    step = _step(len(blocked))
     for layers in network:
         out = now.copy()
         seen = now[0] != 0
 
         def part(start: int, layers: Sequence[Layer] = layers, now: NDArray = now, out: NDArray = out,
                  seen: NDArray = seen) -> None:
-            _pass(cloud, now, out, seen, start, min(start + _POINTS, now.shape[1]), rays, layers)
+            _pass(cloud, now, out, seen, start, min(start + step, now.shape[1]), rays, layers)
 
-        list(pool.map(part, range(0, now.shape[1], _POINTS)))
+        list(pool.map(part, range(0, now.shape[1], step)))
         now = out
     now[1:] += now[0] * even
     return np.ascontiguousarray(now.T)
+
+
+def _step(count: int) -> int:
+    """Points at a time, of so many in all: small meshes give work to all threads, too."""
+    return min(max(count // 4 + 1, 512), _MOST_POINTS)
 
 
 def _pairs(links: Neighbours, start: int, stop: int) -> tuple[NDArray, NDArray, slice]:

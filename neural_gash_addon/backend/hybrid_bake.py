@@ -45,16 +45,15 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     unshadowed = sh.cosine_lobe(mesh.normals, order).astype(np.float32)
     with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
         work = _Work(mesh, scene, order, seed, last, lit, pool, threads, network, unshadowed)
-        error, used, left = None, 0, 0.9
+        error, used, left = None, 0, 1.0
         blocked = np.zeros_like(unshadowed)
-        if len(lit):
-            sample = yield from scaled(work.sample(), 0, 0.1)
-        while len(lit):
+        sample = pool.submit(work.sample) if len(lit) else None  # beside the rest, which waits for rays
+        while sample is not None:
             stop = last if rays is not None else min(max(2 * used, FIRST_RAYS), last)
             share = left if rays is not None else left / 2
             blocked = yield from scaled(work.trace(used, stop), 1 - left, share)
             used, left = stop, left - share
-            error = work.error(blocked, sample)
+            error = work.error(blocked, *sample.result())
             if used == last or (error is not None and tolerance is not None and error <= tolerance):
                 break
     return Transfer(unshadowed - blocked, BakeRecord(
@@ -75,7 +74,8 @@ class _Work:
         self._lit, self._pool, self._threads, self._network = lit, pool, threads, network
         self._sums = np.zeros((len(lit), sh.coefficient_count(order)))
         self._cloud: Cloud | None = None
-        self.probes = 0
+        self._sample_size = min(len(lit), max(_SAMPLE, min(len(lit) // 256, _MOST_SAMPLE)))
+        self.probes = 2 * self._sample_size * _SAMPLE_RAYS
 
     def trace(self, start: int, stop: int) -> Generator[float, None, NDArray[np.float32]]:
         """The blocked part (N, K) of all points, from directions start..stop in addition to those before."""
@@ -87,27 +87,21 @@ class _Work:
             self._cloud = Cloud.of(self._mesh.points, self._mesh.normals, neighbours(self._mesh), self._pool)
         return filtered(self._cloud, blocked, self._unshadowed, stop, self._network, self._pool)
 
-    def sample(self) -> Generator[float, None, tuple[NDArray, NDArray, NDArray]]:
-        """Some points (n,), and two independent traces (n, K) of their blocked part."""
-        size = min(len(self._lit), max(_SAMPLE, min(len(self._lit) // 256, _MOST_SAMPLE)))
+    def sample(self) -> tuple[NDArray, NDArray, NDArray]:
+        """Some points (n,), and two independent traces (n, K) of their blocked part; on the calling thread."""
         rng = np.random.default_rng([self._seed, 1])
-        points = self._lit[np.sort(rng.choice(len(self._lit), size, replace=False))]
+        points = self._lit[np.sort(rng.choice(len(self._lit), self._sample_size, replace=False))]
         few = replace(self._mesh, points=self._mesh.points[points], normals=self._mesh.normals[points],
                       clearance=self._mesh.clearance[points])
-        rows = np.arange(size)
-        found = []
-        for number in range(2):
-            twin = BlockedEstimator(few, self._scene, self._order, int(rng.integers(2**31)), _SAMPLE_RAYS,
-                                    _SAMPLE_SETS)
-            sums = np.zeros((size, sh.coefficient_count(self._order)))
-            yield from scaled(twin.trace(self._pool, self._threads, rows, 0, _SAMPLE_RAYS, sums), 0.5 * number, 0.5)
-            found.append(twin.turned(self._pool, rows, twin.means(rows, sums, 0, _SAMPLE_RAYS)))
-        self.probes = 2 * size * _SAMPLE_RAYS
+        rows = np.arange(len(points))
+        one, two = (BlockedEstimator(few, self._scene, self._order, int(rng.integers(2**31)), _SAMPLE_RAYS,
+                                     _SAMPLE_SETS) for _ in range(2))
+        found = [twin.turned_here(rows, twin.means(rows, twin.summed(rows, 0, _SAMPLE_RAYS), 0, _SAMPLE_RAYS))
+                 for twin in (one, two)]
         return points, found[0], found[1]
 
-    def error(self, blocked: NDArray, sample: tuple[NDArray, NDArray, NDArray]) -> float | None:
+    def error(self, blocked: NDArray, points: NDArray, one: NDArray, two: NDArray) -> float | None:
         """Relative L2 error at the sample. Both traces' noise is independent, so it cancels in the product."""
-        points, one, two = sample
         squared = float(((blocked[points] - one) * (blocked[points] - two)).sum())
         open_sky = self._unshadowed[points]
         energy = float(((open_sky - one) * (open_sky - two)).sum())
