@@ -25,7 +25,7 @@ from neural_gash_addon.backend.geometry import TriangleMesh
 
 BUDGETS = (4, 8, 16, 32)              # rays of Embree that set the time
 LADDER = (2, 3, 4, 6, 8, 12, 16, 24, 32)  # rays of the hybrid that are tried
-ORDER, REFERENCE_RAYS, REPEATS, TARGET = 3, 4096, 5, 0.5
+ORDER, REFERENCE_RAYS, REPEATS, TARGET = 3, 2048, 5, 0.5
 
 
 def read(path: Path) -> TriangleMesh:

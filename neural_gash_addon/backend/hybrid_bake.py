@@ -22,6 +22,7 @@ from .transfer import Transfer
 from .weights import load_hybrid
 
 FIRST_RAYS = 4        # of a bake to a tolerance; doubled until it is met
+_ROWS = 1 << 14       # whose unshadowed transfer one worker computes at a time
 _SAMPLE = 128         # points at which the error is measured, or a 256th of them if that is more
 _MOST_SAMPLE = 2048
 _SAMPLE_RAYS, _SAMPLE_SETS = 64, 4  # of each of two independent traces there
@@ -42,8 +43,11 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
     lit = lit[morton_order(mesh.points[lit])] if len(lit) else lit
     last = MAX_RAYS if rays is None else rays
-    unshadowed = sh.cosine_lobe(mesh.normals, order).astype(np.float32)
+    unshadowed = np.empty((len(mesh.points), sh.coefficient_count(order)), np.float32)
     with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+        for _ in pool.map(lambda rows: np.copyto(unshadowed[rows], sh.cosine_lobe(mesh.normals[rows], order)),
+                          [slice(start, start + _ROWS) for start in range(0, len(unshadowed), _ROWS)]):
+            pass
         work = _Work(mesh, scene, order, seed, last, lit, pool, threads, network, unshadowed)
         error, used, left = None, 0, 1.0
         blocked = np.zeros_like(unshadowed)
@@ -73,7 +77,6 @@ class _Work:
         self._unshadowed = unshadowed
         self._lit, self._pool, self._threads, self._network = lit, pool, threads, network
         self._sums = np.zeros((len(lit), sh.coefficient_count(order)))
-        self._cloud: Cloud | None = None
         self._sample_size = min(len(lit), max(_SAMPLE, min(len(lit) // 256, _MOST_SAMPLE)))
         self.probes = 2 * self._sample_size * _SAMPLE_RAYS
 
@@ -83,9 +86,9 @@ class _Work:
         local = self._estimator.means(self._lit, self._sums, 0, stop)
         blocked = np.zeros((len(self._mesh.points), local.shape[1]), np.float32)
         blocked[self._lit] = self._estimator.turned(self._pool, self._lit, local)
-        if self._cloud is None:
-            self._cloud = Cloud.of(self._mesh.points, self._mesh.normals, neighbours(self._mesh), self._pool)
-        return filtered(self._cloud, blocked, self._unshadowed, stop, self._network, self._pool)
+        links = neighbours(self._mesh, blocked[:, 0] != 0)
+        cloud = Cloud.of(self._mesh.points, self._mesh.normals, links, self._pool)
+        return filtered(cloud, blocked, self._unshadowed, stop, self._network, self._pool)
 
     def sample(self) -> tuple[NDArray, NDArray, NDArray]:
         """Some points (n,), and two independent traces (n, K) of their blocked part; on the calling thread."""

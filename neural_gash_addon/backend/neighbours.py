@@ -18,8 +18,12 @@ class Neighbours:
     points: NDArray[np.int32]  # (L,)
 
 
-def neighbours(mesh: TriangleMesh) -> Neighbours:
+def neighbours(mesh: TriangleMesh, seen: NDArray[np.bool_] | None = None) -> Neighbours:
     """The neighbours of a mesh's points.
+
+    Args:
+        seen: (N,) only of these points, of the points beside them, and of those beside the latter;
+            the others are given none.
 
     A triangle a b c makes b a neighbour of a, c of b and a of c: each edge of a closed mesh is so
     found once in each direction, without a search. Texels have the four beside them that are covered.
@@ -27,15 +31,30 @@ def neighbours(mesh: TriangleMesh) -> Neighbours:
     if mesh.domain == TEXEL:
         assert mesh.texels is not None
         point, other = _in_grid(mesh.texels, mesh.side)
+        if seen is not None:
+            near = seen.copy()
+            near[point[seen[other]]] = True
+            kept = near[point] | near[other]
+            point, other = point[kept], other[kept]
     else:
         triangles: NDArray = mesh.triangles
         if mesh.domain == CORNER:
             assert mesh.corners is not None
             triangles = mesh.elements[mesh.corners]
+        if seen is not None:
+            near = seen.copy()
+            near[triangles[_any(seen, triangles)]] = True
+            triangles = triangles[_any(near, triangles)]
         point, other = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
     order = _sorting(point)
     start = np.concatenate([[0], np.cumsum(np.bincount(point, minlength=len(mesh.points)))])
     return Neighbours(start, other[order].astype(np.int32))
+
+
+def _any(flags: NDArray[np.bool_], triangles: NDArray) -> NDArray[np.bool_]:
+    """(F,) whether a flag of (N,) is set at one of the corners of each triangle (F, 3)."""
+    a, b, c = (flags.take(triangles[:, corner]) for corner in range(3))
+    return a | b | c
 
 
 def _in_grid(texels: NDArray[np.int64], side: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
