@@ -16,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 import trimesh
 from meshes import FOLDER
+from scipy.stats import theilslopes
 from table import Table, seconds
 
 from neural_gash_addon.backend import methods, metrics
@@ -37,8 +38,8 @@ def read(path: Path) -> TriangleMesh:
 def curve(mesh: TriangleMesh, reference: np.ndarray, ladder: tuple[int, ...]) -> dict[str, list[tuple[float, float]]]:
     """(seconds, SRR) of both methods at each number of rays, measured in turns.
 
-    Seconds are the least of REPEATS, and never more than with more rays: what a busy machine adds is
-    no method's. SRR is the median over seeds.
+    Seconds are those of a line in the number of rays, fitted to the least of REPEATS at each (Theil and Sen):
+    a bake costs so much, and so much a ray; the rest is the machine's. SRR is the median over seeds.
     """
     unshadowed = sh.cosine_lobe(mesh.normals, ORDER)
     found: dict[str, list[tuple[float, float]]] = {"embree": [], "hybrid": []}
@@ -53,8 +54,8 @@ def curve(mesh: TriangleMesh, reference: np.ndarray, ladder: tuple[int, ...]) ->
         for name, measured in runs.items():
             found[name].append((min(t for t, _ in measured), statistics.median(s for _, s in measured)))
     for name, points in found.items():
-        times = np.minimum.accumulate([t for t, _ in points][::-1])[::-1]
-        found[name] = [(float(t), s) for t, (_, s) in zip(times, points, strict=True)]
+        slope, base, _, _ = theilslopes([t for t, _ in points], ladder)
+        found[name] = [(base + max(slope, 1e-9) * rays, s) for rays, (_, s) in zip(ladder, points, strict=True)]
     return found
 
 

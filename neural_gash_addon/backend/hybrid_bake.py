@@ -25,7 +25,9 @@ FIRST_RAYS = 4        # of a bake to a tolerance; doubled until it is met
 _ROWS = 1 << 14       # whose unshadowed transfer one worker computes at a time
 _SAMPLE = 128         # points at which the error is measured, or a 256th of them if that is more
 _MOST_SAMPLE = 2048
-_SAMPLE_RAYS, _SAMPLE_SETS = 64, 4  # of each of two independent traces there
+_SAMPLE_SETS = 4
+# Rays of each of two independent traces there, by those of the bake: a larger error needs fewer to be measured.
+_SAMPLE_TIMES, _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS = 4, 32, 128
 
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
@@ -78,7 +80,8 @@ class _Work:
         self._lit, self._pool, self._threads, self._network = lit, pool, threads, network
         self._sums = np.zeros((len(lit), sh.coefficient_count(order)))
         self._sample_size = min(len(lit), max(_SAMPLE, min(len(lit) // 256, _MOST_SAMPLE)))
-        self.probes = 2 * self._sample_size * _SAMPLE_RAYS
+        self._sample_rays = int(np.clip(_SAMPLE_TIMES * rays, _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS))
+        self.probes = 2 * self._sample_size * self._sample_rays
 
     def trace(self, start: int, stop: int) -> Generator[float, None, NDArray[np.float32]]:
         """The blocked part (N, K) of all points, from directions start..stop in addition to those before."""
@@ -97,9 +100,9 @@ class _Work:
         few = replace(self._mesh, points=self._mesh.points[points], normals=self._mesh.normals[points],
                       clearance=self._mesh.clearance[points])
         rows = np.arange(len(points))
-        one, two = (BlockedEstimator(few, self._scene, self._order, int(rng.integers(2**31)), _SAMPLE_RAYS,
+        one, two = (BlockedEstimator(few, self._scene, self._order, int(rng.integers(2**31)), self._sample_rays,
                                      _SAMPLE_SETS) for _ in range(2))
-        found = [twin.turned_here(rows, twin.means(rows, twin.summed(rows, 0, _SAMPLE_RAYS), 0, _SAMPLE_RAYS))
+        found = [twin.turned_here(rows, twin.means(rows, twin.summed(rows, 0, self._sample_rays), 0, self._sample_rays))
                  for twin in (one, two)]
         return points, found[0], found[1]
 
