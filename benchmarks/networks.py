@@ -83,8 +83,8 @@ def main() -> None:
         with (FOLDER / "MANIFEST.csv").open(newline="") as file:
             categories = {Path(row["file"]).stem: row["category"] for row in csv.DictReader(file)}
     print(f"Order {ORDER}, {default_threads()} threads; SRR against {REFERENCE_RAYS} rays with a seed of their own. "
-          "Each cell: the hybrid's SRR in the time that Embree takes with so many rays, over Embree's; –: two rays of the "
-          "hybrid take longer. Last but one: the same at equal rays, 8.\n")
+          "Each cell: the hybrid's SRR in the time that Embree takes with so many rays, over Embree's; –: two rays "
+          "of the hybrid take longer. Last but one: the same at equal rays, 8.\n")
     print("| mesh | category | vertices | " + " | ".join(f"{b} rays" for b in BUDGETS)
           + " | equal rays, 8 | hybrid µs/vertex at 4 |")
     print("|---" * (5 + len(BUDGETS)) + "|", flush=True)
