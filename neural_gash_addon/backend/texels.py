@@ -105,6 +105,36 @@ def fill_map(covered: NDArray[np.bool_], texels: int = 8) -> NDArray[np.int64]:
     return np.maximum(_fill(source), 0).ravel()
 
 
+def mirrored(covered: NDArray[np.bool_], source: NDArray[np.int64], texels: int = 8
+             ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Empty texels near covered ones, and for each the covered texel as far inside as it is outside.
+
+    Twice what the nearest covered texel shows, less what the mirrored one does, goes on beyond a chart
+    as it goes within: so mip levels, whose texels reach over its outline, are as right there as inside.
+
+    Args:
+        covered: (side, side). source: (side * side,) of `fill_map`. texels: how far outside.
+    Returns:
+        (n,) texels, and (n,) mirrored ones, all in the same part of the texture without a gap between.
+    """
+    side = covered.shape[0]
+    rows, columns = np.nonzero(~covered)
+    nearest = source[rows * side + columns]
+    up, along = nearest // side - rows, nearest % side - columns
+    steps = np.maximum(np.abs(up), np.abs(along))
+    near = (steps > 0) & (steps <= texels)
+    rows, columns, up, along, steps = (a[near] for a in (rows, columns, up, along, steps))
+    whole = np.all([(rows + 2 * up >= 0), (rows + 2 * up < side), (columns + 2 * along >= 0),
+                    (columns + 2 * along < side)], axis=0)
+    for step in range(1, texels + 1):
+        share = 1 + np.minimum(step / steps, 1)
+        row = np.clip(np.rint(rows + share * up).astype(np.int64), 0, side - 1)
+        column = np.clip(np.rint(columns + share * along).astype(np.int64), 0, side - 1)
+        whole &= covered[row, column]
+    outside, inside = rows * side + columns, (rows + 2 * up) * side + columns + 2 * along
+    return outside[whole], inside[whole]
+
+
 def _spread(source: NDArray[np.int64]) -> NDArray[np.int64]:
     """Empty texels take the nearest of what their eight neighbours show."""
     side = source.shape[0]

@@ -22,13 +22,22 @@ from .progress import scaled
 from .raster import Layout
 from .raycast import Geometry, Occluders
 from .record import IDENTITY, BakeRecord
-from .texels import NormalMap, fill_map, texel_points
+from .texels import NormalMap, fill_map, mirrored, texel_points
 
 CHANNELS = 4             # coefficients that one image holds
 _LAYOUT_SHARE = 0.1      # of the progress
 _TILE = 1 << 18          # texels of a tile, covered or not: some seconds of work
 _OURS = re.compile(r"\d{4}\.(npy|json)")
 _JOB = "job.json"
+
+
+@dataclass(frozen=True, eq=False)
+class FillMap:
+    """How the texels of a texture follow from the covered ones."""
+
+    source: NDArray[np.int64]   # (side * side,) the covered texel that each shows,
+    outside: NDArray[np.int64]  # (n,) but these show what goes on linearly from there
+    inside: NDArray[np.int64]   # (n,) and from their mirror images
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,21 +50,24 @@ class TextureTransfer:
     inside: list[NDArray[np.bool_]]          # of each tile, (n,) texels whose centre is on the mesh, not beside
     record: BakeRecord
 
-    def fill_map(self) -> NDArray[np.int64]:
-        """Which covered texel each of the side * side shows; see `texels.fill_map`."""
+    def fill_map(self) -> FillMap:
+        """What the texels show that no face covers; see `texels.fill_map` and `texels.mirrored`."""
         side = self.record.side
         covered = np.zeros(side * side, bool)
         for texels in self.texels:
             covered[texels] = True
-        return fill_map(covered.reshape(side, side))
+        source = fill_map(covered.reshape(side, side))
+        return FillMap(source, *mirrored(covered.reshape(side, side), source))
 
-    def image(self, index: int, filled: NDArray[np.int64]) -> NDArray[np.float32]:
+    def image(self, index: int, filled: FillMap) -> NDArray[np.float32]:
         """Numbers 4 * index .. 4 * index + 3 of the texels as an image (side * side, 4), row 0 at the bottom."""
         out = np.zeros((self.record.side ** 2, CHANNELS), np.float32)
         for texels, coefficients in zip(self.texels, self.coefficients, strict=True):
             part = coefficients[:, CHANNELS * index:CHANNELS * (index + 1)]
             out[texels, :part.shape[1]] = part
-        return out[filled]
+        image = out[filled.source]
+        image[filled.outside] = 2 * image[filled.outside] - out[filled.inside]
+        return image
 
 
 def image_count(terms: int) -> int:

@@ -292,3 +292,34 @@ def test_a_fitted_texture_has_the_error_asked_for(tolerance):
         found = lookup(result, np.einsum("nc,ncx->nx", weights, uv[mesh.corners[faces]]))
         errors.append(metrics.rel_l2(found, exact))
     assert errors[0] < 1.5 * tolerance < 6 * errors[1], (side, errors)
+
+
+@pytest.mark.parametrize(("padding", "levels"), [(2, 1), (4, 2), (8, 3)])
+def test_no_seam_at_the_mip_levels_that_the_padding_keeps_apart(padding, levels):
+    mesh, side = surface(shapes.sphere()), 512
+    result = methods.run(texture.bake(mesh, "analytic", 3, side=side, padding=padding))
+    uv, ends = result.uv[mesh.corners], {}
+    for face, triangle in enumerate(mesh.triangles):
+        for edge in range(3):
+            ends[triangle[edge], triangle[(edge + 1) % 3]] = uv[face, edge], uv[face, (edge + 1) % 3]
+    cut = {pair for pair, places in ends.items() if not np.allclose(places, ends[pair[::-1]][::-1])}
+    assert len(cut) > 10
+    vertex_normals = np.zeros_like(mesh.positions)
+    vertex_normals[mesh.corner_vertices] = mesh.corner_normals
+    filled = result.fill_map()
+    images = [result.image(i, filled).reshape(side, side, 4) for i in range(3)]
+    for level in range(levels + 1):
+        if level:
+            images = [im.reshape(len(im) // 2, 2, len(im) // 2, 2, 4).mean((1, 3)) for im in images]
+        half = 0.5 / len(images[0])
+        error = []
+        for pairs in (cut, ends.keys() - cut):
+            pairs = np.array(sorted(pairs))
+            share = np.random.default_rng(level).uniform(size=(len(pairs), 1))
+            places = np.array([ends[tuple(p)] for p in pairs])
+            places = np.clip(places[:, 0] * (1 - share) + places[:, 1] * share, half, 1 - half)  # no texture repeats
+            normals = vertex_normals[pairs[:, 0]] * (1 - share) + vertex_normals[pairs[:, 1]] * share
+            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+            found = np.concatenate([bilinear(im, places) for im in images], 1)[:, :9]
+            error.append(metrics.rel_l2(found, sh.cosine_lobe(normals, 3)))
+        assert error[0] <= 2 * error[1], (level, error)
