@@ -74,9 +74,9 @@ def context():
 @pytest.fixture
 def operator():
     """The logic of the Bake operator outside Blender's operator, with its reports."""
-    from neural_gash_addon.ops.bake import _Baking
+    from neural_gash_addon.ops.bake import Baking
 
-    class Operator(_Baking):
+    class Operator(Baking):
         def __init__(self):
             self.reports = []
 
@@ -218,9 +218,9 @@ def test_unregistering_stops_the_worker(make, settings, operator, context, monke
 
 def test_esc_takes_the_applied_copy_away(make, settings, context, snapshot, monkeypatch):
     from neural_gash_addon.ops.bake import NEURAL_GASH_OT_bake_applied_copy as Copy
-    from neural_gash_addon.ops.bake import _Baking
+    from neural_gash_addon.ops.bake import Baking
     members = {name: vars(Copy)[name] for name in ("_copy", "_begin", "_undo", "_select")}
-    operator = type("Operator", (_Baking,), {**members, "report": lambda *_: None})()
+    operator = type("Operator", (Baking,), {**members, "report": lambda *_: None})()
     make().modifiers.new("Subdivision", "SUBSURF")
     closed = _endless(monkeypatch)
     before = snapshot()
