@@ -11,7 +11,8 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Generator, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
+from queue import SimpleQueue
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,27 +62,35 @@ class BlockedEstimator:
         """
         jobs = self._jobs(points, start, stop)
         total = len(points)
-        pending: dict[Future, NDArray] = {}
-        done = 0
+        # not concurrent.futures.wait: Ctrl-C inside it leaves the futures' locks taken, and the workers stuck
+        finished: SimpleQueue[tuple[NDArray, NDArray | None, Exception | None]] = SimpleQueue()
+
+        def work(rows: NDArray, tables: tuple[NDArray, NDArray]) -> None:
+            try:
+                finished.put((rows, self._blocked_sums(points[rows], *tables), None))
+            except Exception as error:  # noqa: BLE001  raised again where it is awaited
+                finished.put((rows, None, error))
+
+        waiting = done = 0
+        whole = False
         try:
             while True:
-                while len(pending) < 2 * threads and (job := next(jobs, None)) is not None:
-                    rows, tables = job
-                    pending[pool.submit(self._blocked_sums, points[rows], *tables)] = rows
-                if not pending:
+                while waiting < 2 * threads and (job := next(jobs, None)) is not None:
+                    pool.submit(work, *job)
+                    waiting += 1
+                if not waiting:
+                    whole = True
                     return
-                for future in wait(pending, return_when=FIRST_COMPLETED).done:
-                    rows = pending.pop(future)
-                    sums[rows] += future.result()
-                    done += len(rows)
+                rows, found, error = finished.get()
+                waiting -= 1
+                if error is not None:
+                    raise error
+                sums[rows] += found
+                done += len(rows)
                 yield done / total
         finally:
-            if pending:  # closed or failed half-way
+            if not whole:  # closed or failed half-way: what is left of the jobs does nothing
                 self._stop.set()
-                for future in pending:
-                    future.cancel()
-                wait(pending)
-                self._stop.clear()
 
     def summed(self, points: NDArray, start: int, stop: int) -> NDArray[np.float64]:
         """What `trace` adds for a few points, at once and on the calling thread: (n, K)."""

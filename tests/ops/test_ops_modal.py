@@ -217,8 +217,8 @@ def test_unregistering_stops_the_worker(make, settings, operator, context, monke
 
 
 def test_esc_takes_the_applied_copy_away(make, settings, context, snapshot, monkeypatch):
-    from neural_gash_addon.ops.bake import NEURAL_GASH_OT_bake_applied_copy as Copy
     from neural_gash_addon.ops.bake import Baking
+    from neural_gash_addon.ops.bake import NEURAL_GASH_OT_bake_applied_copy as Copy
     members = {name: vars(Copy)[name] for name in ("_copy", "_begin", "_undo", "_select")}
     operator = type("Operator", (Baking,), {**members, "report": lambda *_: None})()
     make().modifiers.new("Subdivision", "SUBSURF")
