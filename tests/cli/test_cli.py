@@ -202,12 +202,17 @@ def test_usage(run):
         assert done.returncode == 2 and "usage" in done.stderr
 
 
+def _heed_interrupts():
+    """In the child: a shell that runs the tests in the background has children ignore Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def _half_way(path):
     """A bake of `path` onto itself that takes minutes, begun: on a terminal, which shows its bar."""
     pty = pytest.importorskip("pty")
     ours, theirs = pty.openpty()
     process = subprocess.Popen(command("bake", path, "--out", path, "--rays", 60000), cwd=ROOT,
-                               stdout=subprocess.DEVNULL, stderr=theirs)
+                               stdout=subprocess.DEVNULL, stderr=theirs, preexec_fn=_heed_interrupts)
     os.close(theirs)
     shown = b""
     try:
