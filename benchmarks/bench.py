@@ -15,7 +15,7 @@ import textures
 import throughput
 from table import Table, machine
 
-from neural_gash_addon.backend.estimator import default_threads
+from neural_gash_addon.backend.workers import default_threads
 
 PARTS = ("throughput", "memory", "error", "job", "ambient", "texture")
 

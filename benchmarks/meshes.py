@@ -15,6 +15,14 @@ _MESHES = {"8K": ("train/raptor.ply", 0, 8_800), "35K": ("train/skull_atlas.ply"
            "250K": ("train/inner_ear.ply", 2, 250_000)}
 
 
+def read(path: Path) -> TriangleMesh:
+    """A mesh file, shaded smooth."""
+    import trimesh
+
+    found = trimesh.load(path, process=False, force="mesh")
+    return TriangleMesh.from_triangles(np.asarray(found.vertices), np.asarray(found.faces))
+
+
 def load(label: str) -> tuple[str, TriangleMesh]:
     """Name and mesh of about `label` vertices: '8K', '35K' or '250K'."""
     file, subdivisions, size = _MESHES[label]

@@ -22,8 +22,8 @@ from neural_gash_addon.backend.errors import UserError
 from neural_gash_addon.backend.geometry import POINT, TriangleMesh, unit
 from neural_gash_addon.backend.raycast import Occluders
 
-ORDER = 3        # bands, 9 coefficients, as the networks give
-VERSION = 2      # raised whenever the same mesh gets other labels or another layout of file
+ORDER = 5        # bands, 25 coefficients: the paper's networks take the first 9
+VERSION = 3      # raised whenever the same mesh gets other labels or another layout of file
 
 Frames = Callable[[NDArray], NDArray]  # unit normals (N, 3) -> rotations (N, 3, 3) that carry e_y to the normal
 
@@ -37,14 +37,14 @@ class Sample:
     positions: NDArray[np.float32]     # (N, 3) points, normalised
     normals: NDArray[np.float32]       # (N, 3) unit; zero where there is none
     triangles: NDArray[np.int32]       # (F, 3) of points; where creases split vertices they do not share them
-    coefficients: NDArray[np.float32]  # (N, 9) transfer with shadows
+    coefficients: NDArray[np.float32]  # (N, 25) transfer with shadows
     visibility: NDArray[np.bool_]      # (N, 25) whether the ray along each direction is free
     directions: NDArray[np.float32]    # (25, 3) in the frame of each point
     record: str                        # JSON of the bake, with its error estimate
 
     @property
     def unshadowed(self) -> NDArray[np.float64]:
-        """(N, 9) transfer without shadows, exact, from the normals."""
+        """(N, 25) transfer without shadows, exact, from the normals."""
         return sh.cosine_lobe(self.normals, ORDER)
 
 

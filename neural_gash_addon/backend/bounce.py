@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from . import sampling
 from . import spherical_harmonics as sh
-from .estimator import default_threads
 from .geometry import INSET, TriangleMesh, unit
 from .patches import Patches
 from .raycast import Geometry, Occluders
 from .transfer import Transfer
+from .workers import default_threads
 
 PATCHES = 8192        # about as many; more sharpen the light that bounces near edges and shadows
 PATCH_RAYS = 128

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import spherical_harmonics as sh
-from .estimator import MAX_RAYS, BlockedEstimator, default_threads, morton_order
+from .estimator import MAX_RAYS, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
 from .progress import scaled
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
 from .transfer import Transfer
+from .workers import default_threads
 
 BLOCK = 1 << 16         # points accumulated at a time, so that memory does not grow with the mesh
 FIRST_RAYS = 32         # of an adaptive point; it has twice that before it may stop

@@ -8,11 +8,8 @@ local frame, where they are one matrix product for many points, and rotated once
 """
 from __future__ import annotations
 
-import os
-import threading
 from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from queue import SimpleQueue
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +18,7 @@ from . import sampling
 from . import spherical_harmonics as sh
 from .geometry import TriangleMesh
 from .raycast import Occluders
+from .workers import results
 
 SETS = 16
 MAX_RAYS = 4096
@@ -48,7 +46,6 @@ class BlockedEstimator:
         self._angles = rng.uniform(0, 2 * np.pi, len(mesh.points)).astype(np.float32)
         self._set_of_point = rng.integers(0, sets, len(mesh.points), dtype=np.uint8)
         self._excess: dict[tuple[int, int], NDArray] = {}
-        self._stop = threading.Event()
 
     def trace(self, pool: ThreadPoolExecutor, threads: int, points: NDArray, start: int, stop: int,
               sums: NDArray[np.float64]) -> Generator[float, None, None]:
@@ -60,37 +57,18 @@ class BlockedEstimator:
         Yields:
             The share of the rays done, after every job. Closing the generator stops the workers.
         """
-        jobs = self._jobs(points, start, stop)
-        total = len(points)
-        # not concurrent.futures.wait: Ctrl-C inside it leaves the futures' locks taken, and the workers stuck
-        finished: SimpleQueue[tuple[NDArray, NDArray | None, Exception | None]] = SimpleQueue()
+        def work(rows: NDArray, tables: tuple[NDArray, NDArray]) -> tuple[NDArray, NDArray]:
+            return rows, self._blocked_sums(points[rows], *tables)
 
-        def work(rows: NDArray, tables: tuple[NDArray, NDArray]) -> None:
-            try:
-                finished.put((rows, self._blocked_sums(points[rows], *tables), None))
-            except Exception as error:  # noqa: BLE001  raised again where it is awaited
-                finished.put((rows, None, error))
-
-        waiting = done = 0
-        whole = False
+        done = 0
+        tracing = results(pool, threads, self._jobs(points, start, stop), work)
         try:
-            while True:
-                while waiting < 2 * threads and (job := next(jobs, None)) is not None:
-                    pool.submit(work, *job)
-                    waiting += 1
-                if not waiting:
-                    whole = True
-                    return
-                rows, found, error = finished.get()
-                waiting -= 1
-                if error is not None:
-                    raise error
+            for rows, found in tracing:
                 sums[rows] += found
                 done += len(rows)
-                yield done / total
+                yield done / len(points)
         finally:
-            if not whole:  # closed or failed half-way: what is left of the jobs does nothing
-                self._stop.set()
+            tracing.close()  # at once: a worker may be waiting
 
     def summed(self, points: NDArray, start: int, stop: int) -> NDArray[np.float64]:
         """What `trace` adds for a few points, at once and on the calling thread: (n, K)."""
@@ -124,8 +102,6 @@ class BlockedEstimator:
 
     def _blocked_sums(self, points: NDArray, lift: NDArray, harmonics: NDArray) -> NDArray[np.float64]:
         """Worker: (n, K) sums of Y_k over the blocked ones of these directions at these points."""
-        if self._stop.is_set():
-            return np.zeros((len(points), harmonics.shape[1]))
         frames = self._frames(points).reshape(-1, 9).astype(np.float32)
         count = len(harmonics)
         directions = _product(frames, lift).reshape(-1, 3)
@@ -195,11 +171,6 @@ def _product(a: NDArray, b: NDArray) -> NDArray:
     np.matmul(a[:whole].reshape(-1, rows, inner), b, out=out[:whole].reshape(-1, rows, outer))
     np.matmul(a[whole:], b, out=out[whole:])
     return out
-
-
-def default_threads() -> int:
-    """One worker a core this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def morton_order(points: NDArray) -> NDArray[np.int64]:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import spherical_harmonics as sh
-from .estimator import default_threads
+from .workers import default_threads
 
 Array = NDArray[np.float64]
 

@@ -20,7 +20,6 @@ from . import gloss, lobes, sampling
 from . import spherical_harmonics as sh
 from .bounce import Bounces, spread
 from .errors import UserError
-from .estimator import default_threads
 from .geometry import Surface, TriangleMesh, unit
 from .progress import scaled
 from .raster import Layout
@@ -28,6 +27,7 @@ from .raycast import Geometry, Occluders
 from .record import BakeRecord
 from .texels import NormalMap, texel_points
 from .texture import TextureTransfer
+from .workers import default_threads
 
 RAYS = 256            # of a texel: with 128 a mirroring floor shows grain
 _RAYS_AT_ONCE = 1 << 15

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import spherical_harmonics as sh
-from .estimator import MAX_RAYS, BlockedEstimator, default_threads, morton_order
+from .estimator import MAX_RAYS, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
 from .hybrid import Cloud, Network, filtered
 from .neighbours import neighbours
@@ -20,6 +20,7 @@ from .raycast import Geometry, Occluders
 from .record import BakeRecord
 from .transfer import Transfer
 from .weights import load_hybrid
+from .workers import default_threads
 
 FIRST_RAYS = 4        # of a bake to a tolerance; doubled until it is met
 _ROWS = 1 << 14       # whose unshadowed transfer one worker computes at a time

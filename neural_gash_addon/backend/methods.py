@@ -5,10 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from . import embree_bake, hybrid_bake
+from . import embree_bake, gnn_bake, hybrid_bake
 from . import spherical_harmonics as sh
 from .bounce import Reflection
 from .errors import UserError
@@ -31,12 +32,14 @@ class Method:
     name: str
     label: str
     description: str
-    traces: bool  # takes rays or a tolerance, and sees occluders
+    traces: bool  # takes rays or a tolerance, and follows bounces
     bake: Callable[..., Baking]
+    # what makes of a mesh and its occluders what the method sees of them; None: it sees no shadows
+    sees: Callable[[TriangleMesh, Sequence[Geometry]], Any] | None = None
 
 
 def _analytic(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
-              occluders: Sequence[Geometry], seed: int, threads: int | None, scene: Occluders | None = None) -> Baking:
+              occluders: Sequence[Geometry], seed: int, threads: int | None, scene: None = None) -> Baking:
     """Unshadowed transfer, exact; only `mesh` and `order` matter."""
     began = time.perf_counter()
     coefficients = np.empty((len(mesh.points), sh.coefficient_count(order)), dtype=np.float32)
@@ -49,19 +52,25 @@ def _analytic(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: fl
         seconds=time.perf_counter() - began, error_estimate=None))
 
 
+def _embree_scene(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> Occluders:
+    return Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
+
+
 METHODS: dict[str, Method] = {m.name: m for m in (
     Method("analytic", "Unshadowed", "Exact shading of the normals alone, without any shadows; instant",
            traces=False, bake=_analytic),
     Method("embree", "Ray traced", "Traces rays with Embree to find what blocks the light; the reference",
-           traces=True, bake=embree_bake.bake),
+           traces=True, bake=embree_bake.bake, sees=_embree_scene),
     Method("hybrid", "Few rays and network", "Traces few rays, and a small network takes the rest from neighbours: "
-           "smooth at once, and exact with many rays", traces=True, bake=hybrid_bake.bake),
+           "smooth at once, and exact with many rays", traces=True, bake=hybrid_bake.bake, sees=_embree_scene),
+    Method("gnn", "Network", "A network reads the surface around each point, with no ray: soft shadows, quickly",
+           traces=False, bake=gnn_bake.bake, sees=gnn_bake.voxels_of),
 )}
 
 
 def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: int | None = None,
          tolerance: float | None = None, occluders: Sequence[Geometry] = (), seed: int = 0,
-         threads: int | None = None, scene: Occluders | None = None, reflection: Reflection | None = None) -> Baking:
+         threads: int | None = None, scene: Any = None, reflection: Reflection | None = None) -> Baking:
     """Bake the transfer of a mesh's points.
 
     Args:
@@ -71,7 +80,7 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
         tolerance: relative L2 error to reach with as few rays as that takes (at most MAX_RAYS a
             point). A method that traces wants exactly one of the two.
         occluders: what else blocks, parts (positions (V, 3), triangles (F, 3)) in the same frame.
-        scene: mesh and occluders in Embree, where they are there already from another bake.
+        scene: mesh and occluders as the method `sees` them, where they are there already from another bake.
         reflection: light that bounces, if any shall; for methods that trace.
         seed: independent seeds give independent errors. threads: one a core where not given.
     Yields:
@@ -97,7 +106,7 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
         return entry.bake(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed,
                           threads=threads, scene=scene)
     if scene is None:
-        scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
+        scene = _embree_scene(mesh, occluders)
     direct = entry.bake(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed, threads=threads,
                         scene=scene)
     return _with_bounces(direct, mesh, occluders, scene, threads, reflection)

@@ -52,7 +52,7 @@ def fitting_side(surface: Surface, uv: NDArray, *, error: float, method: str = "
     sample = Coverage(1, np.arange(len(faces)), faces, weights, weights)
     points = texel_points(surface, sample, normal_maps)
     scene = None
-    if methods.METHODS[method].traces:
+    if methods.METHODS[method].sees:
         scene = Occluders([(points.positions, points.triangles), *occluders], points.resolution)
     trace = partial(_traced, method=method, order=order, scene=scene, seed=seed, threads=threads)
     yield 0.0

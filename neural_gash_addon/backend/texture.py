@@ -8,6 +8,7 @@ import time
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from .exchange import atomic, reason
 from .geometry import Surface
 from .progress import scaled
 from .raster import Layout
-from .raycast import Geometry, Occluders
+from .raycast import Geometry
 from .record import IDENTITY, BakeRecord
 from .texels import NormalMap, fill_map, mirrored, texel_points
 
@@ -102,7 +103,7 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
     layout = Layout(uv[surface.corners], surface.triangles, side)
     digest = hashlib.blake2b(uv.tobytes(), digest_size=16).hexdigest()
     store = _Store(folder, f"{key} {side} {digest}") if folder is not None else None
-    scene: Occluders | None = None
+    scene: Any = None
     rows = max(1, _TILE // side)
     texels, coefficients, inside, records = [], [], [], []
     for number, start in enumerate(range(0, side, rows)):
@@ -115,8 +116,8 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
         found = store.load(number, len(coverage.texels)) if store else None
         if found is None:
             mesh = texel_points(surface, coverage, normal_maps)
-            if scene is None and methods.METHODS[method].traces:
-                scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
+            if scene is None and (sees := methods.METHODS[method].sees):
+                scene = sees(mesh, occluders)
             baking = methods.bake(mesh, method, order, rays=rays, tolerance=tolerance, seed=_tile_seed(seed, number),
                                   occluders=occluders, threads=threads, scene=scene, reflection=reflection)
             transfer = yield from scaled(baking, done, share)

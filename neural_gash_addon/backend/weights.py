@@ -20,7 +20,7 @@ from .exchange import atomic
 from .hybrid import Layer, Network
 
 FOLDER = Path(__file__).parent / "networks"
-HYBRID = "hybrid.safetensors"
+HYBRID, GNN = "hybrid.safetensors", "gnn.safetensors"
 CHECKSUMS = "checksums.json"  # file name -> SHA-256, beside the weights
 
 
@@ -78,3 +78,9 @@ def load_hybrid(path: Path = FOLDER / HYBRID) -> Network:
     passes = 1 + max(int(name.split(".")[0]) for name in arrays)
     depth = 1 + max(int(name.split(".")[1]) for name in arrays)
     return [[Layer(arrays[f"{p}.{n}.weight"], arrays[f"{p}.{n}.bias"]) for n in range(depth)] for p in range(passes)]
+
+
+@lru_cache(maxsize=1)
+def load_gnn(path: Path = FOLDER / GNN) -> dict[str, NDArray[np.float32]]:
+    """The network of `gnn.answer`. Raises UserError as `load`."""
+    return load(path)

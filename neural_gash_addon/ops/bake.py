@@ -173,7 +173,7 @@ def _bake_refusal(context: bpy.types.Context) -> str:
     if state.running:
         return "A bake is running; press Esc to cancel it."
     settings = context.scene.neural_gash
-    if METHODS[settings.method].traces and not settings.occluder_mode():
+    if METHODS[settings.method].sees and not settings.occluder_mode():
         return refusal(context.object) or "Choose the collection whose objects cast shadows."
     return refusal(context.object)
 

@@ -87,7 +87,7 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
     depsgraph = context.evaluated_depsgraph_get()
     read = read_object(obj, depsgraph)
     method = methods.METHODS[settings.method]
-    mode = _occluder_mode(obj, settings, group) if method.traces else SELF
+    mode = _occluder_mode(obj, settings, group) if method.sees else SELF
     quality = {}
     if method.traces:
         by_rays = settings.quality == RAYS

@@ -125,9 +125,11 @@ class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):
         if METHODS[settings.method].traces:
             layout.prop(settings, "quality", expand=True)
             layout.prop(settings, "rays" if settings.quality == RAYS else "tolerance")
+        if METHODS[settings.method].sees:
             layout.prop(settings, "occluders")
             if settings.occluders == COLLECTION:
                 layout.prop(settings, "collection")
+        if METHODS[settings.method].traces:
             layout.prop(settings, "bounces")
         layout.prop(settings, "target", expand=True)
         if settings.target == TEXTURE:

@@ -100,7 +100,7 @@ def test_a_run_goes_on_where_it_was(tmp_path):
         new = labels.load(path)
         for key in labels.ARRAYS:
             assert np.array_equal(getattr(new, key), getattr(old, key)), key
-        assert new.coefficients.shape == (len(new.positions), 9) and new.coefficients.dtype == np.float32
+        assert new.coefficients.shape == (len(new.positions), 25) and new.coefficients.dtype == np.float32
         assert new.visibility.shape == (len(new.positions), 25) and new.visibility.dtype == bool
         assert new.name.startswith(new.category)
     assert not [p for p in tmp_path.iterdir() if p not in paths]  # no drafts are left

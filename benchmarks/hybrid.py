@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The hybrid beside plain Embree at equal total time, on meshes that nothing was tuned on; per mesh and category.
+
+`.venv/bin/python benchmarks/hybrid.py` reads ../shared/meshes/validation, or --folder.
+"""
+from __future__ import annotations
+
+import argparse
+import csv
+import statistics
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import numpy as np
+from meshes import FOLDER, read
+from scipy.stats import theilslopes
+from table import Table, seconds
+
+from neural_gash_addon.backend import methods, metrics
+from neural_gash_addon.backend import spherical_harmonics as sh
+from neural_gash_addon.backend.geometry import TriangleMesh
+from neural_gash_addon.backend.workers import default_threads
+
+BUDGETS = (4, 8, 16, 32)              # rays of Embree that set the time
+LADDER = (2, 3, 4, 6, 8, 12, 16, 24, 32)  # rays of the hybrid that are tried
+ORDER, REFERENCE_RAYS, REPEATS, TARGET = 3, 2048, 5, 0.5
+
+
+def curve(mesh: TriangleMesh, reference: np.ndarray, ladder: tuple[int, ...]) -> dict[str, list[tuple[float, float]]]:
+    """(seconds, SRR) of both methods at each number of rays, measured in turns.
+
+    Seconds are those of a line in the number of rays, fitted to the least of REPEATS at each (Theil and Sen):
+    a bake costs so much, and so much a ray; the rest is the machine's. SRR is the median over seeds.
+    """
+    unshadowed = sh.cosine_lobe(mesh.normals, ORDER)
+    found: dict[str, list[tuple[float, float]]] = {"embree": [], "hybrid": []}
+    for rays in ladder:
+        runs: dict[str, list[tuple[float, float]]] = {name: [] for name in found}
+        for seed in range(REPEATS):
+            for name, measured in runs.items():
+                kept: list[np.ndarray] = []
+                baking = methods.bake(mesh, name, ORDER, rays=rays, seed=seed)  # begins when it is run
+                spent = seconds(lambda baking=baking, kept=kept: kept.append(methods.run(baking).coefficients))
+                measured.append((spent, metrics.srr(kept[0], reference, unshadowed)))
+        for name, measured in runs.items():
+            found[name].append((min(t for t, _ in measured), statistics.median(s for _, s in measured)))
+    for name, points in found.items():
+        slope, base, _, _ = theilslopes([t for t, _ in points], ladder)
+        found[name] = [(base + max(slope, 1e-9) * rays, s) for rays, (_, s) in zip(ladder, points, strict=True)]
+    return found
+
+
+def at_time(points: list[tuple[float, float]], spent: float) -> float:
+    """SRR that a method reaches in a time, on lines through its logarithms; NaN where its fewest rays take longer."""
+    if spent < points[0][0]:
+        return float("nan")
+    times, errors = (np.log(np.maximum(column, 1e-12)) for column in np.array(points).T)
+    return float(np.exp(np.interp(np.log(spent), times, errors)))
+
+
+def shown(ratio: float) -> str:
+    """A cell."""
+    return f"{ratio:.2f}" if np.isfinite(ratio) else "–"
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--folder", type=Path, default=FOLDER / "validation")
+    parser.add_argument("--only", help="files whose name has this in it")
+    arguments = parser.parse_args()
+    categories = {}
+    if (FOLDER / "MANIFEST.csv").is_file():
+        with (FOLDER / "MANIFEST.csv").open(newline="") as file:
+            categories = {Path(row["file"]).stem: row["category"] for row in csv.DictReader(file)}
+    print(f"Order {ORDER}, {default_threads()} threads; SRR against {REFERENCE_RAYS} rays with a seed of their own. "
+          "Each cell: the hybrid's SRR in the time that Embree takes with so many rays, over Embree's; –: two rays "
+          "of the hybrid take longer. Last but one: the same at equal rays, 8.\n")
+    print("| mesh | category | vertices | " + " | ".join(f"{b} rays" for b in BUDGETS)
+          + " | equal rays, 8 | hybrid µs/vertex at 4 |")
+    print("|---" * (5 + len(BUDGETS)) + "|", flush=True)
+    ratios: dict[int, list[tuple[str, float]]] = {budget: [] for budget in BUDGETS}
+    equal: list[float] = []
+    for path in sorted(arguments.folder.glob("*.ply")):
+        if arguments.only and arguments.only not in path.stem:
+            continue
+        mesh = read(path)
+        reference = methods.run(methods.bake(mesh, "embree", ORDER, rays=REFERENCE_RAYS, seed=77)).coefficients
+        found = curve(mesh, reference, LADDER)
+        category = categories.get(path.stem, "")
+        for budget in BUDGETS:
+            spent, error = found["embree"][LADDER.index(budget)]
+            ratios[budget].append((category, at_time(found["hybrid"], spent) / error))
+        at = LADDER.index(8)
+        equal.append(found["hybrid"][at][1] / found["embree"][at][1])
+        cost = 1e6 * found["hybrid"][LADDER.index(4)][0] / len(mesh.points)
+        print(f"| {path.stem} | {category} | {len(mesh.points):,} | "
+              + " | ".join(shown(ratios[b][-1][1]) for b in BUDGETS) + f" | {equal[-1]:.2f} | {cost:.1f} |", flush=True)
+    for category in sorted({c for c, _ in ratios[BUDGETS[0]]}):
+        medians = [float(np.nanmedian([r for c, r in ratios[b] if c == category])) for b in BUDGETS]
+        print(f"| median | {category} | | " + " | ".join(map(shown, medians)) + " | | |")
+    table = Table()
+    table.heading("Hybrid at equal time", "SRR of the hybrid over Embree's in the same time, median and worst mesh.")
+    table.add("equal rays (8), median", "", "", statistics.median(equal))
+    table.add("equal rays (8), worst mesh", "", "", max(equal))
+    for budget in BUDGETS:
+        values = [r for _, r in ratios[budget] if np.isfinite(r)]
+        if not values:
+            table.absent(f"{budget} rays", "the hybrid takes longer than that on every mesh")
+            continue
+        table.add(f"{budget} rays, meshes where the hybrid takes no longer", f"{len(values)}", f"{len(ratios[budget])}")
+        table.add(f"{budget} rays, median", "", "", statistics.median(values), TARGET, most=True)
+        table.add(f"{budget} rays, worst mesh", "", "", max(values), 1.0, most=True)
+
+
+if __name__ == "__main__":
+    main()

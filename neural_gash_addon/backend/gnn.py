@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Transfer from a network that reads a pooled graph of the surface: no rays, and occluders however far along it.
+
+The two stages of Neural-GASh (section 4.2), made to see far. Its networks pass messages between neighbours on the
+surface, so a vertex knows nothing of a jaw that is near in space and far along the mesh (section 4.4.2). Here the
+graph is pooled: its coarse nodes are voxels at a pyramid of scales (`voxels`), and a point has an edge to the node
+at each of fifteen distances along each of 25 directions, those of the paper's visibility samples in the frame of the
+point's motor (`cones`). Stage 1 is one perceptron that all directions share, with a bias for each: what blocks this
+cone. Stage 2 is one of all directions together: the blocked part of the coefficients in the motor's frame, which is
+then turned. What is not blocked is exact.
+
+A motor's frame spins about the pole -e_y (see `conformal`). Points that face there are given another, whose pole is
++e_y, and between the two the answers are blended: so no two neighbours differ by where a pole is.
+
+The networks run in NumPy; torch trains them (`training.gnn`).
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import cones, conformal
+from . import spherical_harmonics as sh
+from .conformal import DIRECTION_COUNT
+from .geometry import TriangleMesh
+from .voxels import Pyramid
+
+ORDER = 5              # bands that the network gives
+CHUNK = 512            # points at a time: what is between the layers stays in the second-level cache
+_BLAS_SERIAL = 1 << 18  # multiply-adds up to which OpenBLAS stays on the calling thread
+_BLEND = (-0.3, -0.7)  # heights of the normal between which the frame's pole changes
+_OVER = np.diag([1.0, -1.0, -1.0])  # half a turn about e_x
+
+Network = Mapping[str, NDArray[np.float32]]  # weights (outputs, inputs) and biases of the layers, see `answer`
+
+
+def blocked(mesh: TriangleMesh, voxels: Pyramid, network: Network, order: int, rows: NDArray) -> NDArray[np.float32]:
+    """The blocked part (n, K) of some points, given by their indices (n,); on the calling thread."""
+    points, normals = mesh.points[rows], mesh.normals[rows]
+    share = np.clip((normals[:, 1] - _BLEND[0]) / (_BLEND[1] - _BLEND[0]), 0, 1)
+    share = share * share * (3 - 2 * share)  # of the frame whose pole is +e_y
+    out = np.zeros((len(rows), order * order), np.float32)
+    for over, weight in ((False, 1 - share), (True, share)):
+        here = np.flatnonzero(weight > 0)
+        if not len(here):
+            continue
+        frames = frames_of(normals[here], over)
+        local = answer(cones.read(voxels, points[here], normals[here], frames), network)[:, :order * order]
+        out[here] += weight[here, None] * sh.rotate_each(local, frames)
+    return out
+
+
+def frames_of(normals: NDArray, over: bool) -> NDArray[np.float64]:
+    """Rotations (n, 3, 3) that carry e_y to normals (n, 3): of the motor, or of the one whose pole is +e_y."""
+    if over:
+        normals = normals @ _OVER
+    frames = conformal.frames(conformal.motor(np.zeros_like(normals), normals))
+    return _OVER @ frames if over else frames
+
+
+def answer(seen: NDArray[np.float32], network: Network) -> NDArray[np.float32]:
+    """The blocked part (n, ORDER**2) in the frames in which `seen` (F, 25, n) was read."""
+    features, _, count = seen.shape
+    now = _layer(network, "cone.0", seen.reshape(features, -1))
+    now = now.reshape(-1, DIRECTION_COUNT, count)
+    now += network["direction"].T[:, :, None]
+    np.maximum(now, 0, out=now)
+    now = _rectified(network, "cone.1", now.reshape(len(now), -1))
+    now = now.reshape(-1, count)  # of each unit of stage 1, all directions
+    now = _rectified(network, "point.0", now)
+    now = _rectified(network, "point.1", now)
+    return _layer(network, "point.2", now).T
+
+
+def _layer(network: Network, name: str, values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(outputs, n) of values (inputs, n), in products too small for BLAS to spread over threads of its own."""
+    weight, bias = network[f"{name}.weight"], network[f"{name}.bias"]
+    out = np.empty((len(weight), values.shape[1]), np.float32)
+    columns = max(1, _BLAS_SERIAL // weight.size)
+    for start in range(0, values.shape[1], columns):
+        part = slice(start, start + columns)
+        np.matmul(weight, values[:, part], out=out[:, part])
+    out += bias[:, None]
+    return out
+
+
+def _rectified(network: Network, name: str, values: NDArray[np.float32]) -> NDArray[np.float32]:
+    out = _layer(network, name, values)
+    return np.maximum(out, 0, out=out)
+

@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Work spread over threads, whose results come as they are done."""
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from queue import SimpleQueue
+from typing import TypeVar
+
+Result = TypeVar("Result")
+
+
+def default_threads() -> int:
+    """One worker a core this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def results(pool: ThreadPoolExecutor, threads: int, jobs: Iterable[tuple], work: Callable[..., Result]
+            ) -> Generator[Result, None, None]:
+    """`work(*job)` of each job, in the order in which they end; two jobs wait for each of the threads.
+
+    Closing the generator, or an error, leaves the jobs undone that have not begun. An error is raised here.
+    """
+    # not concurrent.futures.wait: Ctrl-C inside it leaves the futures' locks taken, and the workers stuck
+    finished: SimpleQueue[tuple[Result | None, Exception | None]] = SimpleQueue()
+    stop = threading.Event()
+
+    def run(job: tuple) -> None:
+        try:
+            finished.put((None if stop.is_set() else work(*job), None))
+        except Exception as error:  # noqa: BLE001  raised again where it is awaited
+            finished.put((None, error))
+
+    remaining = iter(jobs)
+    waiting = 0
+    try:
+        while True:
+            while waiting < 2 * threads and (job := next(remaining, None)) is not None:
+                pool.submit(run, job)
+                waiting += 1
+            if not waiting:
+                return
+            found, error = finished.get()
+            waiting -= 1
+            if error is not None:
+                raise error
+            yield found  # type: ignore[misc]  # None comes only after the end
+    finally:
+        stop.set()
