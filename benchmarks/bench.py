@@ -9,6 +9,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import ambient
+import bounces
 import equal_error
 import memory
 import textures
@@ -17,7 +18,7 @@ from table import Table, machine
 
 from neural_gash_addon.backend.workers import default_threads
 
-PARTS = ("throughput", "memory", "error", "job", "ambient", "texture")
+PARTS = ("throughput", "memory", "error", "job", "ambient", "texture", "bounces")
 
 
 def main() -> int:
@@ -42,6 +43,8 @@ def main() -> int:
         ambient.measure(table, threads)
     if "texture" in parts:
         textures.measure(table, threads, args.quick)
+    if "bounces" in parts:
+        bounces.measure(table, threads)
     missed = table.missed()
     print(f"\n{len(missed)} target(s) missed" + "".join(f"\n- {row}" for row in missed))
     return 1 if missed else 0

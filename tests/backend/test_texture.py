@@ -103,6 +103,8 @@ def test_texels_per_metre_decide_the_side():
 def test_too_small_a_texture_is_refused():
     with pytest.raises(UserError, match="too small"):
         atlas(surface(shapes.torus(), smooth=False), 16, padding=8)
+    with pytest.raises(UserError, match="too small for the charts"):  # of which none was placed
+        atlas(surface(shapes.torus(), smooth=False), 16, padding=64)
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e3])

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The bakes by the paper's own networks, `mlp` and `gnn-paper`: for comparison. They need torch, imported here."""
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections.abc import Generator, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import conformal, weights
+from . import spherical_harmonics as sh
+from .errors import UserError
+from .geometry import TriangleMesh
+from .graph import Graph, graph
+from .neighbours import neighbours
+from .raycast import Geometry
+from .record import BakeRecord
+from .transfer import Transfer
+
+ORDER = 3  # bands that the paper's networks give
+_LOGGER = logging.getLogger(__name__)
+
+
+def import_torch(method: str) -> Any:
+    """torch. Raises UserError where it is not installed, or does not start."""
+    try:
+        import torch
+    except (ImportError, OSError) as error:
+        raise UserError(f"The method '{method}' needs PyTorch, which this Python has not; get it with "
+                        f"'{sys.executable} -m pip install torch', or choose another method.") from error
+    return torch
+
+
+def placed(points: NDArray) -> NDArray[np.float64]:
+    """Points (N, 3) as the networks know them: box centred on the origin, longest side 1."""
+    low, high = points.min(0), points.max(0)
+    return (points - (low + high) / 2) / (float((high - low).max()) or 1.0)
+
+
+def _bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
+          occluders: Sequence[Geometry], seed: int, threads: int | None, method: str, scene: None = None
+          ) -> Generator[float, None, Transfer]:
+    """Ask the network at every point; arguments as `methods.bake`, of which rays, tolerance and seed do not matter.
+
+    Raises:
+        UserError: no torch, more bands than the network has, or weights that are not those that were shipped.
+    """
+    began = time.perf_counter()
+    if order > ORDER:
+        raise UserError(f"The method '{method}' gives orders up to {ORDER}; choose a lower order or another method.")
+    torch = import_torch(method)
+    arrays = weights.load(weights.FOLDER / f"{method}.safetensors")
+    lit = np.any(mesh.normals != 0, axis=1)
+    encoded = conformal.encode(placed(mesh.points), mesh.normals).astype(np.float32)
+    yield 0.1
+    edges = (graph(mesh.points, neighbours(mesh)) if method == "gnn-paper"
+             else Graph(np.zeros(len(lit) + 1, np.int64), np.zeros(0, np.int64)))
+    yield 0.4
+    ask = partial(_answer, torch, method, arrays, encoded, edges)
+    try:
+        blocked = ask("cuda" if torch.cuda.is_available() else "cpu")
+    except torch.cuda.OutOfMemoryError:
+        _LOGGER.warning("The GPU has too little memory for this mesh; its processor does the work.")
+        torch.cuda.empty_cache()
+        blocked = ask("cpu")
+    coefficients = sh.cosine_lobe(mesh.normals, order) - blocked[:, :sh.coefficient_count(order)]
+    coefficients[~lit] = 0
+    return Transfer(coefficients.astype(np.float32), BakeRecord(
+        method=method, order=order, points=len(lit), domain=mesh.domain, rays=0, seed=seed,
+        seconds=time.perf_counter() - began, error_estimate=None))
+
+
+def _answer(torch: Any, method: str, arrays: dict[str, NDArray[np.float32]], encoded: NDArray[np.float32],
+            edges: Graph, device: str) -> NDArray[np.float32]:
+    """The blocked part (N, 9)."""
+    from .networks import paper
+
+    network = paper.Mlp() if method == "mlp" else paper.TwoStage()
+    network.load_state_dict({name: torch.from_numpy(array.copy()) for name, array in arrays.items()})
+    network.to(device).eval()
+    with torch.no_grad():
+        found = network(*(torch.from_numpy(array).to(device) for array in (encoded, edges.source, edges.start)))
+        return (found if method == "mlp" else found[0]).cpu().numpy()
+
+
+bake_mlp = partial(_bake, method="mlp")
+bake_gnn = partial(_bake, method="gnn-paper")
