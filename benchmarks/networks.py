@@ -25,7 +25,7 @@ ORDER, REFERENCE_RAYS, REPEATS = 3, 2048, 3
 RAYS = (4, 8, 16, 32)  # of Embree, beside
 MOST_SRR, MOST_OVER, MOST_COST = 0.35, 1.05, 15.0  # asked for: over all, on the worst mesh, µs a vertex
 
-NETWORKS = [name for name, method in methods.METHODS.items() if method.sees and not method.traces]
+NETWORKS = [name for name, method in methods.METHODS.items() if name != "analytic" and not method.traces]
 COLUMNS: list[tuple[str, int | None]] = [*((name, None) for name in NETWORKS), *(("embree", rays) for rays in RAYS)]
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from . import embree_bake, gnn_bake, hybrid_bake
+from . import embree_bake, gnn_bake, hybrid_bake, paper_bake
 from . import spherical_harmonics as sh
 from .bounce import Reflection
 from .errors import UserError
@@ -65,6 +65,12 @@ METHODS: dict[str, Method] = {m.name: m for m in (
            "smooth at once, and exact with many rays", traces=True, bake=hybrid_bake.bake, sees=_embree_scene),
     Method("gnn", "Network", "A network reads the surface around each point, with no ray: soft shadows, quickly",
            traces=False, bake=gnn_bake.bake, sees=gnn_bake.voxels_of),
+    Method("gnn-paper", "Paper's network (PyTorch)", "The two-stage graph network of Neural-GASh, for comparison: "
+           "shadows of what is near along the surface", traces=False, bake=paper_bake.bake_gnn),
+    Method("gnn-paper-ao", "Paper's network with AO (PyTorch)", "The same, darkened where neighbours stand above the "
+           "surface", traces=False, bake=paper_bake.bake_gnn_ao),
+    Method("mlp", "Paper's perceptron (PyTorch)", "The first version of Neural-GASh, for comparison: each point by "
+           "itself, with no shadows seen", traces=False, bake=paper_bake.bake_mlp),
 )}
 
 

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from . import conformal, weights
 from . import spherical_harmonics as sh
 from .errors import UserError
-from .geometry import TriangleMesh
+from .geometry import TEXEL, TriangleMesh
 from .graph import Graph, graph
 from .neighbours import neighbours
 from .raycast import Geometry
 from .record import BakeRecord
+from .refine import refined
 from .transfer import Transfer
 
 ORDER = 3  # bands that the paper's networks give
@@ -45,23 +46,26 @@ def placed(points: NDArray) -> NDArray[np.float64]:
 def _bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
           occluders: Sequence[Geometry], seed: int, threads: int | None, method: str, scene: None = None
           ) -> Generator[float, None, Transfer]:
-    """Ask the network at every point; arguments as `methods.bake`, of which rays, tolerance and seed do not matter.
+    """Ask the network at every point; arguments as `methods.bake`, of which only mesh and order matter.
 
     Raises:
-        UserError: no torch, more bands than the network has, or weights that are not those that were shipped.
+        UserError: no torch, texels, more bands than the network has, or weights that are not those that were shipped.
     """
     began = time.perf_counter()
     if order > ORDER:
         raise UserError(f"The method '{method}' gives orders up to {ORDER}; choose a lower order or another method.")
+    if mesh.domain == TEXEL:
+        raise UserError(f"The method '{method}' was made for vertices; bake to them, or choose another method.")
     torch = import_torch(method)
-    arrays = weights.load(weights.FOLDER / f"{method}.safetensors")
+    name = "mlp" if method == "mlp" else "gnn-paper"
+    arrays = weights.load(weights.FOLDER / f"{name}.safetensors")
     lit = np.any(mesh.normals != 0, axis=1)
     encoded = conformal.encode(placed(mesh.points), mesh.normals).astype(np.float32)
     yield 0.1
-    edges = (graph(mesh.points, neighbours(mesh)) if method == "gnn-paper"
+    edges = (graph(mesh.points, neighbours(mesh)) if name != "mlp"
              else Graph(np.zeros(len(lit) + 1, np.int64), np.zeros(0, np.int64)))
     yield 0.4
-    ask = partial(_answer, torch, method, arrays, encoded, edges)
+    ask = partial(_answer, torch, name, arrays, encoded, edges)
     try:
         blocked = ask("cuda" if torch.cuda.is_available() else "cpu")
     except torch.cuda.OutOfMemoryError:
@@ -69,24 +73,27 @@ def _bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float 
         torch.cuda.empty_cache()
         blocked = ask("cpu")
     coefficients = sh.cosine_lobe(mesh.normals, order) - blocked[:, :sh.coefficient_count(order)]
+    if method == "gnn-paper-ao":
+        coefficients = refined(coefficients, mesh.points, mesh.normals, edges)
     coefficients[~lit] = 0
     return Transfer(coefficients.astype(np.float32), BakeRecord(
         method=method, order=order, points=len(lit), domain=mesh.domain, rays=0, seed=seed,
         seconds=time.perf_counter() - began, error_estimate=None))
 
 
-def _answer(torch: Any, method: str, arrays: dict[str, NDArray[np.float32]], encoded: NDArray[np.float32],
+def _answer(torch: Any, name: str, arrays: dict[str, NDArray[np.float32]], encoded: NDArray[np.float32],
             edges: Graph, device: str) -> NDArray[np.float32]:
     """The blocked part (N, 9)."""
     from .networks import paper
 
-    network = paper.Mlp() if method == "mlp" else paper.TwoStage()
-    network.load_state_dict({name: torch.from_numpy(array.copy()) for name, array in arrays.items()})
+    network = paper.Mlp() if name == "mlp" else paper.TwoStage()
+    network.load_state_dict({key: torch.from_numpy(array.copy()) for key, array in arrays.items()})
     network.to(device).eval()
     with torch.no_grad():
         found = network(*(torch.from_numpy(array).to(device) for array in (encoded, edges.source, edges.start)))
-        return (found if method == "mlp" else found[0]).cpu().numpy()
+        return (found if name == "mlp" else found[0]).cpu().numpy()
 
 
 bake_mlp = partial(_bake, method="mlp")
 bake_gnn = partial(_bake, method="gnn-paper")
+bake_gnn_ao = partial(_bake, method="gnn-paper-ao")

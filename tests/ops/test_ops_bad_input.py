@@ -170,7 +170,8 @@ def _meshes(draw):
 
 
 @sampling(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
-@given(case=_meshes(), method=st.sampled_from(["embree", "analytic"]), order=st.sampled_from([2, 3, 5]))
+@given(case=_meshes(), method=st.sampled_from(["embree", "analytic", "hybrid", "gnn"]),
+       order=st.sampled_from([2, 3, 5]))
 def test_random_broken_meshes(case, method, order, make, settings, refused, snapshot):
     """Finite coefficients or one sentence, and after a refusal the scene is what it was."""
     positions, faces, scale, smooth = case

@@ -39,6 +39,37 @@ def test_analytic_takes_no_rays(make, settings):
     assert read_transfer(obj)[1].rays == 0
 
 
+@pytest.mark.parametrize("target", ["VERTICES", "TEXTURE"])
+def test_the_network_sees_what_stands_around(make, settings, target):
+    """A floor with a box right above it is dark, and is open without the box."""
+    from neural_gash_addon.scene.attributes import read_record
+    box = make([(3 * x, 3 * y, z + 1.1) for x, y, z in CUBE[0]], CUBE[1], "Box")
+    corners = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9)), -1).reshape(-1, 2)
+    floor = make([(x, y, 0) for x, y in corners],
+                 [(i, i + 1, i + 10, i + 9) for i in range(71) if i % 9 < 8], "Floor")
+    settings.method, settings.target, settings.side, settings.sizing = "gnn", target, 32, "RESOLUTION"
+    brightest = {}
+    for occluders in ("SELF", "VISIBLE"):
+        settings.occluders = occluders
+        assert bpy.ops.neural_gash.bake() == {"FINISHED"}
+        record = read_record(floor)
+        assert (record.method, record.rays, record.error_estimate) == ("gnn", 0, None)
+        brightest[occluders] = _first_coefficients(floor)
+    assert brightest["SELF"].mean() > 0.27 and brightest["VISIBLE"].mean() < 0.08  # all open: 0.282
+    assert box.data.get("neural_gash") is None
+
+
+def _first_coefficients(obj):
+    """Coefficient 0 of each vertex, or of the texels that the floor covers."""
+    from neural_gash_addon.scene.attributes import read_transfer
+    if not obj.data.uv_layers:
+        return read_transfer(obj)[0][:, 0]
+    image = next(image for image in bpy.data.images if " PRT 0" in image.name)
+    pixels = np.empty(4 * image.size[0] * image.size[1], np.float32)
+    image.pixels.foreach_get(pixels)
+    return pixels.reshape(-1, 4)[:, 0]
+
+
 def test_flat_cube_is_unshadowed_on_each_face(make, settings):
     from neural_gash_addon.backend import spherical_harmonics as sh
     from neural_gash_addon.scene.attributes import read_transfer
