@@ -27,7 +27,7 @@ from .curves import draw
 
 CONE = (48, 16)                # units of stage 1
 POINT = (160, 96)              # of stage 2
-STEPS, RATE, WARM_UP = 14_000, 2e-3, 300
+STEPS, RATE, WARM_UP = 12_000, 2e-3, 300
 POINTS = 3000                  # of a step
 MOST_POINTS = 60_000           # of a mesh in memory
 FLOOR = 3e-4                   # of the unshadowed energy: the labels' own noise, and what no eye sees

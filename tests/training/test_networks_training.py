@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Trainings of the networks, in small: they learn, go on where they were stopped, and turn labels as meshes."""
+import csv
+
+import numpy as np
+import pytest
+import trimesh
+
+torch = pytest.importorskip("torch")
+
+from neural_gash_addon.backend import conformal  # noqa: E402
+from neural_gash_addon.backend import spherical_harmonics as sh  # noqa: E402
+from neural_gash_addon.backend.exchange import write_npz  # noqa: E402
+from training import curves, gnn, labels, paper  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    """Two labelled meshes."""
+    folder = tmp_path_factory.mktemp("cache")
+    for name, mesh in (("torus", trimesh.creation.torus(1, 0.45, 24, 12)),
+                       ("cup", trimesh.creation.annulus(0.6, 1.0, 1.2).subdivide())):
+        found = labels.label(mesh.vertices, mesh.faces, None, name=name, category="test", rays=128, seed=1)
+        write_npz(folder / f"{name}-0.npz", **{key: np.asarray(getattr(found, key))
+                                               for key in (*labels.ARRAYS, *labels.TEXTS)})
+    return folder
+
+
+def samples(cache):
+    return [labels.load(path) for path in sorted(cache.glob("*.npz"))]
+
+
+def test_gnn_learns_and_goes_on_from_its_checkpoint(cache, tmp_path, monkeypatch):
+    monkeypatch.setattr(gnn, "POINTS", 200)
+    monkeypatch.setattr(gnn, "WARM_UP", 5)
+    monkeypatch.setattr(gnn, "EVERY", 20)
+    known = samples(cache)
+    whole = gnn.train(known, known, 40, 3, tmp_path / "one", tmp_path / "one.csv")
+    with (tmp_path / "one.csv").open(newline="") as file:
+        losses = [float(row["loss"]) for row in csv.DictReader(file)]
+    assert len(losses) == 2 and losses[1] < losses[0]
+
+    class Stopped(Exception):
+        pass
+
+    def stop(*arguments):
+        raise Stopped
+
+    with monkeypatch.context() as patch:
+        patch.setattr(gnn.Trainer, "save", lambda self, save=gnn.Trainer.save: (save(self), stop()))
+        with pytest.raises(Stopped):
+            gnn.train(known, known, 40, 3, tmp_path / "two", tmp_path / "two.csv")
+    again = gnn.train(known, known, 40, 3, tmp_path / "two", tmp_path / "two.csv")
+    for one, two in zip(whole.parameters(), again.parameters(), strict=True):
+        np.testing.assert_allclose(two.detach(), one.detach(), atol=1e-6)
+
+
+@pytest.mark.parametrize("parts", [0.0, 1.0])
+def test_gnn_examples_have_the_labels_of_their_frames(cache, parts):
+    """Local coefficients of fully blocked points would be the lobe about e_y; energy and share do not turn."""
+    sample = samples(cache)[0]
+    seen, truth = gnn.example(sample, 500, np.random.default_rng(0), parts)
+    assert seen.shape[2] == len(truth) and torch.isfinite(seen).all()
+    blocked = sh.cosine_lobe(sample.normals, labels.ORDER) - sample.coefficients
+    if not parts:
+        assert float(truth[:, 0].sum()) == pytest.approx(float(blocked[:, 0].sum()), rel=1e-4)
+        assert float(truth.square().sum()) == pytest.approx(float(np.square(blocked).sum()), rel=1e-3)
+
+
+@pytest.mark.parametrize("network", ["mlp", "gnn-paper", "end-to-end"])
+def test_the_papers_networks_learn(cache, tmp_path, network, monkeypatch):
+    monkeypatch.setattr(paper, "EVERY", 15)
+    known = [paper.Source(path) for path in sorted(cache.glob("*.npz"))]
+    model = paper.train(network, "motor", 0, known, known, 30, tmp_path / "log.csv")
+    with (tmp_path / "log.csv").open(newline="") as file:
+        losses = [float(row["loss"]) for row in csv.DictReader(file)]
+    assert losses[-1] < losses[0]
+    assert np.isfinite(paper.evaluate(model, known, "motor").srr_median)
+    assert curves.draw(tmp_path / "log.csv", ["srr_median"]).stat().st_size > 1000
+
+
+@pytest.mark.parametrize("encoding", list(paper.ENCODINGS))
+def test_encodings_have_the_width_that_they_say(cache, encoding):
+    known = paper.Source(sorted(cache.glob("*.npz"))[0])
+    example = known.example(encoding, np.random.default_rng(0))
+    assert example.encoded.shape == (len(example.blocked), paper.ENCODINGS[encoding][0])
+
+
+def test_turned_patches_see_what_the_turned_mesh_shows(cache):
+    """Visibility traced anew after a turn is that of the same mesh labelled turned."""
+    known = paper.Source(sorted(cache.glob("*.npz"))[1])
+    plain, turned = known.example("plain", None), known.example("plain", np.random.default_rng(4))
+    # the share that is blocked does not turn; the directions differ, so single rays do
+    assert float(turned.visibility.mean()) == pytest.approx(float(plain.visibility.mean()), abs=0.02)
+    normals = turned.encoded[:, 3:].double().numpy()
+    up = conformal.frames(conformal.motor(np.zeros_like(normals), normals))[:, :, 1]
+    np.testing.assert_allclose(up, normals, atol=1e-6)
