@@ -2,8 +2,8 @@
 """Whole glossy pictures from five bands beside Mitsuba 3's, by Phong exponent: `python benchmarks/gloss_scenes.py`.
 
 Three scenes are made here; the two from the folder of meshes are left out where that is not.
-Mitsuba's scalar variant runs everywhere and takes half an hour on two cores; with LLVM 16 or
-later on the machine, `--variant llvm_ad_rgb` takes minutes.
+Mitsuba's scalar variant runs everywhere and takes some 40 minutes on two cores; with a new LLVM
+on the machine (14 and 15 are too old), `--variant llvm_ad_rgb --samples 256` takes ten.
 """
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from neural_gash_addon.backend import embree_bake, gloss, methods
 from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.raycast import Geometry
 
-SIZE = 160, 120
-SHOWN, SHOWN_EXPONENT = ("knot", "Cornell box", "armory"), 20
+SIZE = 200, 150
+SHOWN, SHOWN_EXPONENT = ("knot", "head", "armory"), 20
 _MORE = 9       # bands, to see how fast what is cut off falls
 _PER_SIDE = 3   # points seen in a pixel are twice the square of this
 _RAYS = 512     # of a point, for its transfer
@@ -107,7 +107,7 @@ def main() -> None:
         rows, strip = measure(name, geometry, camera, args.samples)
         table += rows
         strips += [strip] * (name in SHOWN)
-    print("| scene | Phong exponent | error | of it band limit | of it noise | 9 bands | no shadows |")
+    print("\n| scene | Phong exponent | error | of it band limit | of it noise | 9 bands | no shadows |")
     print("|---|---|---|---|---|---|---|")
     print("\n".join(table))
     args.out.mkdir(parents=True, exist_ok=True)

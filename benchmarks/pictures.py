@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The same glossy picture twice: from transfer, in NumPy, and path traced, by Mitsuba 3.
 
-Both see facets through a pinhole, and average over the same square pixels. The lobe is Phong's,
-(n+1)/(2 pi) max(r.w, 0)**n, times the cosine: B = int L V max(n.w, 0) lobe(w) dw. (As a BRDF that is
-(n+1)/(2 pi) max(r.w, 0)**n; with n+2 in place of n+1 a mirror-like one would keep all energy at
-normal incidence. The lobe that integrates to 1 is the one whose zonal coefficients `lobes` has.)
+Both see facets through a pinhole, and average over the same square pixels. The BRDF is Phong's,
+(n+1)/(2 pi) max(r.w, 0)**n, so that B = int L V max(n.w, 0) lobe(w) dw with a lobe that integrates
+to 1: the one whose zonal coefficients `lobes` has. (With n+2 for n+1 it would reflect all of a
+white sky at normal incidence; this is a factor of both pictures.)
 """
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Camera:
     height: int
 
     def rays(self, per_side: int, seed: int) -> NDArray[np.float64]:
-        """Directions (H, W, per_side**2, 3), one in each cell of a grid over each pixel, anywhere in it. Row 0 on top."""
+        """Directions (H, W, per_side**2, 3), somewhere in each cell of a grid over each pixel; row 0 is on top."""
         jitter = np.random.default_rng([seed, 7]).random((2, self.height, self.width, per_side, per_side))
         cell = np.arange(per_side)
         x = (np.arange(self.width)[:, None, None] + (cell[:, None] + jitter[0]) / per_side) / self.width
@@ -130,7 +130,7 @@ class PathTraced:
         trimesh.Trimesh(*geometry, process=False).export(self._file)
         mi.register_bsdf("neural_gash_phong", _phong(mi))
         self._sensor = {
-            "type": "perspective", "fov": camera.degrees, "fov_axis": "x",
+            "type": "perspective", "fov": camera.degrees, "fov_axis": "x", "sampler": {"type": "multijitter"},
             "to_world": mi.ScalarTransform4f().look_at(list(camera.origin), list(camera.target), [0, 0, 1]),
             "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height, "pixel_format": "rgba",
                      "rfilter": {"type": "box"}}}
