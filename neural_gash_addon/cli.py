@@ -19,18 +19,21 @@ import numpy as np
 from .backend import exchange, methods, shading
 from .backend import light as sh_light
 from .backend.errors import UserError
+from .backend.lobes import GGX, PHONG
 from .backend.transfer import Transfer
 from .ops.batch import finish_batch, prepare_batch
 from .ops.job import summary
 from .properties import COLLECTION, FIT, RAYS, RESOLUTION, TEXTURE, TOLERANCE, VERTICES, NeuralGashSettings
 from .scene import lighting
 from .scene.attributes import has_bake, read_record
+from .scene.gloss import can_gloss
 from .scene.preview import preview_on
 from .scene.read import make_applied_copy
 from .scene.render import render_preview, silent_blender
 from .scene.world import linear_pixels, rotated_light
 
 OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+_LOBES = [lobe.lower() for lobe in (GGX, PHONG)]
 
 _IMPORTERS: dict[str, Callable[[str], object]] = {
     ".obj": lambda path: bpy.ops.wm.obj_import(filepath=path),
@@ -67,6 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     bake.add_argument("--uv-map", metavar="NAME", default="", help="of the mesh, for --texture; else one is made")
     bake.add_argument("--textures", metavar="FOLDER", type=Path, help="write the textures as .exr there, not into OUT")
     bake.add_argument("--half", action="store_true", help="textures of 16 bits a channel instead of 32")
+    bake.add_argument("--gloss", choices=_LOBES, help="show what materials mirror, with this lobe, with --texture")
     bake.add_argument("--out", metavar="OUT.blend", type=Path, help="save the file with the bake in it")
     bake.add_argument("--npz", metavar="OUT.npz", type=Path, help="save points and coefficients")
     bake.add_argument("--png", metavar="OUT.png", type=Path,
@@ -82,6 +86,7 @@ def _parser() -> argparse.ArgumentParser:
     relight.add_argument("--hdri", metavar="FILE", type=Path, help="equirectangular image; else the file's World")
     relight.add_argument("--rotation", type=float, default=0.0, metavar="DEG", help="about the vertical axis (0)")
     relight.add_argument("--strength", type=float, default=1.0, help="factor on the light (1)")
+    relight.add_argument("--gloss", choices=_LOBES, help="show what materials mirror, with this lobe (of a texture)")
     relight.add_argument("--png", metavar="OUT.png", type=Path,
                          help="render (a .blend only; .exr: linear, 32 bits)")
     relight.add_argument("--npz", metavar="OUT.npz", type=Path, help="save radiance (N, 3), albedo 1 (a .npz only)")
@@ -125,6 +130,8 @@ def _bake(arguments: argparse.Namespace) -> tuple[list[dict], str]:
     """`bake`."""
     if arguments.texture is None and (arguments.uv_map or arguments.textures or arguments.half or arguments.share):
         raise UserError("--uv-map, --textures, --half and --share belong to a bake with --texture.")
+    if arguments.gloss and (arguments.texture is None or arguments.bounces):
+        raise UserError("--gloss belongs to a bake with --texture and without --bounces.")
     if arguments.npz is not None and len(arguments.objects or ()) > 1:
         raise UserError("--npz holds the points of one object; bake several one by one.")
     if arguments.texture is not None and arguments.npz is not None:
@@ -157,6 +164,8 @@ def _bake(arguments: argparse.Namespace) -> tuple[list[dict], str]:
         settings.texture_folder = str(arguments.textures.absolute()) if arguments.textures else ""
     else:
         settings.target = VERTICES
+    if arguments.gloss:
+        settings.gloss, settings.lobe = True, arguments.gloss.upper()
     if arguments.applied_copy:
         objects = [make_applied_copy(obj, bpy.context.evaluated_depsgraph_get()) for obj in objects]
         bpy.context.view_layer.update()
@@ -199,6 +208,8 @@ def _relight(arguments: argparse.Namespace) -> tuple[list[dict], str]:
     if suffix == ".npz":
         if arguments.png or arguments.object:
             raise UserError("A .npz has no mesh to render; give the .blend for --png, or --npz for numbers.")
+        if arguments.gloss:
+            raise UserError("A .npz has no materials that could mirror; --gloss is for a .blend.")
         if arguments.hdri is None:
             raise UserError("A .npz has no World; give the light with --hdri.")
         arrays, record = exchange.load_npz(Path(arguments.input))
@@ -213,13 +224,15 @@ def _relight(arguments: argparse.Namespace) -> tuple[list[dict], str]:
         _open(arguments.input)
         obj = _choose([o for o in bpy.context.scene.objects if has_bake(o)], arguments.object, "baked")
         record = read_record(obj)
+        if arguments.gloss and not can_gloss(record):
+            raise UserError(f"--gloss needs a bake to a texture without bounces, which that of '{obj.name}' is not.")
         scene = bpy.context.scene
         if arguments.hdri is None:
             lighting.take_light(scene)
         else:
             lighting.store_light(scene, _hdri_light(arguments.hdri, methods.sh.MAX_ORDER))
         scene.neural_gash.light_rotation, scene.neural_gash.light_strength = turn
-        preview_on(obj)
+        preview_on(obj, arguments.gloss.upper() if arguments.gloss else "")
         lighting.light_object(scene, obj)
         if arguments.png:
             render_preview([obj], arguments.png.absolute(), camera=scene.camera)

@@ -10,6 +10,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, Po
 from .backend.atlas import MAX_SIDE, MIN_SIDE
 from .backend.bounce import MAX_BOUNCES
 from .backend.estimator import MAX_RAYS
+from .backend.lobes import GGX, PHONG
 from .backend.methods import METHODS, MIN_ORDER, MIN_TOLERANCE
 from .backend.spherical_harmonics import MAX_ORDER
 from .scene.lighting import apply_light, show_gloss
@@ -102,10 +103,19 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
         name="Glossy", default=False, update=_gloss_changed,
         description="Show what the materials mirror of the light, by their roughness, on objects baked to textures "
                     "without bounces")
+    lobe: EnumProperty(  # type: ignore[valid-type]
+        name="Lobe", description="How materials spread what they mirror, by their roughness", default=GGX,
+        update=_gloss_changed,
+        items=[(GGX, "GGX", "Microfacets: a bright middle and wide tails, as in Blender's own shaders"),
+               (PHONG, "Phong", "A power of the cosine, (1/roughness^4 - 1)/2: as wide, without the tails")])
     soften: BoolProperty(  # type: ignore[valid-type]
         name="Reduce Ringing", default=False, update=_light_changed,
         description="Damp the dark and bright rings that a small bright light leaves at low orders; "
                     "this also softens the light a little")
+
+    def lobe_shown(self) -> str:
+        """The lobe of glossy previews; '' where they are dull."""
+        return self.lobe if self.gloss else ""
 
     def occluder_mode(self) -> str:
         """'SELF', 'VISIBLE' or the name of the collection; '' where a collection is wanted and none is chosen."""

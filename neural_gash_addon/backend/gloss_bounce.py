@@ -42,6 +42,7 @@ class Finish:
     albedo: NDArray[np.float64]     # (F, 3) diffuse
     specular: NDArray[np.float64]   # (F, 3) of the lobe
     roughness: NDArray[np.float64]  # (F,) Blender's, 0 to 1
+    lobe: str = lobes.GGX           # what the roughness means
 
 
 class GlossyBounces:
@@ -62,8 +63,8 @@ class GlossyBounces:
         self._bounces = Bounces(parts, finish.albedo, scene, self._order, seed, threads)
         patches = self._bounces.patches
         self._specular = patches.mean(finish.specular)
-        self._damping = np.repeat(lobes.ggx_attenuation(patches.mean(finish.roughness[:, None])[:, 0], self._order),
-                                  2 * np.arange(self._order) + 1, axis=1)              # (M, K)
+        bands = lobes.attenuation(patches.mean(finish.roughness[:, None])[:, 0], self._order, finish.lobe)
+        self._damping = np.repeat(bands, 2 * np.arange(self._order) + 1, axis=1)       # (M, K)
         self._normals = unit(patches.mean(patches.normals))                            # (M, 3)
         self._leaving = np.zeros((0, self._order ** 2, 3), np.float32)  # by the direction of the ray that meets it
 

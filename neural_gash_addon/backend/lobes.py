@@ -14,7 +14,26 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+GGX, PHONG = "GGX", "PHONG"  # what a roughness may mean
+
 _NODES = 2049  # roughnesses tabulated: linear interpolation between them errs by less than 1e-6
+
+
+def attenuation(roughness: ArrayLike, order: int, lobe: str = GGX) -> Array:
+    """Attenuation of the lobe that a material of Blender's roughness r has, for r (...,): (..., order) float64."""
+    return phong_attenuation(phong_exponent(roughness), order) if lobe == PHONG else ggx_attenuation(roughness, order)
+
+
+def phong_exponent(roughness: ArrayLike) -> Array:
+    """Exponent n of the Phong lobe as wide as a microfacet lobe of Blender's roughness r, alpha = r*r: (...,) float64.
+
+    2/alpha**2 - 2 is the exponent of the half vector, which makes half the angle that w makes with
+    r; so of w it is a quarter of that (Fisher and Woo 1994, "R.E versus N.H specular highlights").
+    1 is the even hemisphere (n = 0), 0 a mirror; r = (2n + 1)**-0.25 gives any exponent. Clamped.
+    """
+    with np.errstate(divide="ignore"):
+        out: Array = 0.5 / np.clip(np.asarray(roughness, dtype=np.float64), 0, 1) ** 4 - 0.5
+    return out
 
 
 def phong_attenuation(exponent: ArrayLike, order: int) -> Array:

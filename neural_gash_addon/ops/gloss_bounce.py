@@ -41,6 +41,7 @@ class _Job:
     record: BakeRecord
     light: NDArray   # (K, 3) in the frame of the bake
     finish: NDArray  # (F, 7)
+    lobe: str
     baking: Generator[float, None, TextureTransfer]
 
 
@@ -88,11 +89,12 @@ class NEURAL_GASH_OT_bake_gloss(Baking, bpy.types.Operator):
         read = read_object(obj, depsgraph)
         finish = read_finish(obj, record.occluders, depsgraph)
         light = sh.rotate(current_light(context.scene, record.order), turn_since(obj, record))
+        lobe = context.scene.neural_gash.lobe
         baking = bake(read.surface, read_uv(obj.data, record.uv_map), record, light,
-                      Finish(finish[:, :3], finish[:, 3:6], finish[:, 6]), bounces=self.bounces,
+                      Finish(finish[:, :3], finish[:, 3:6], finish[:, 6], lobe), bounces=self.bounces,
                       occluders=read_occluders(obj, record.occluders, depsgraph),
                       normal_maps=read_normal_maps(obj, depsgraph, read.surface, read.matrix))
-        return _Job(obj.session_uid, [obj.name], record, light, finish, baking)
+        return _Job(obj.session_uid, [obj.name], record, light, finish, lobe, baking)
 
     def _finish(self, context: bpy.types.Context, job: _Job, transfer: TextureTransfer) -> set[str]:
         obj = next((o for o in bpy.data.objects if o.session_uid == job.uid), None)
@@ -102,10 +104,10 @@ class NEURAL_GASH_OT_bake_gloss(Baking, bpy.types.Operator):
             raise UserError(f"'{obj.name}' or what shadows it was changed during the bake; bake again.")
         images = bake_images(obj.data, job.record)
         made = make_images(obj.name, transfer, folder_of(images), images[0].use_half_precision, label="prt_gloss")
-        write_bounces(obj.data, made, transfer.record, job.light, job.finish)
+        write_bounces(obj.data, made, transfer.record, job.light, job.finish, job.lobe)
         context.scene.neural_gash.gloss = True
         if not is_glossy(obj):
-            preview_on(obj, True)
+            preview_on(obj, context.scene.neural_gash.lobe)
         light_object(context.scene, obj)
         self.report({"INFO"}, f"Baked {transfer.record.bounces} glossy bounce"
                     f"{'s' if transfer.record.bounces > 1 else ''} in {transfer.record.seconds:.2f} s.")

@@ -208,7 +208,7 @@ def finish(context: bpy.types.Context, job: Job, transfer: Transfer | TextureTra
     except UserError as error:
         warning = f"{error} The preview keeps the light it had."
     try:
-        preview_on(obj, context.scene.neural_gash.gloss)
+        preview_on(obj, context.scene.neural_gash.lobe_shown())
     except UserError as error:
         preview_off(obj)
         warning = str(error)

@@ -72,7 +72,7 @@ class NEURAL_GASH_OT_preview(bpy.types.Operator):
             preview_off(obj)
             return {"FINISHED"}
         try:
-            preview_on(obj, context.scene.neural_gash.gloss)
+            preview_on(obj, context.scene.neural_gash.lobe_shown())
         except UserError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

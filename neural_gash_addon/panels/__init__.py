@@ -100,11 +100,13 @@ class NEURAL_GASH_PT_light(_Panel, bpy.types.Panel):
         layout.prop(settings, "light_strength")
         layout.prop(settings, "soften")
         layout.prop(settings, "gloss")
+        if settings.gloss:
+            layout.prop(settings, "lobe")
         obj = context.object
         if settings.gloss and has_bake(obj):
             layout.operator("neural_gash.bake_gloss", icon="SHADING_RENDERED")
             if has_bounces(obj.data) and not bounces_shown(obj.data):
-                layout.label(text="Glossy bounces are of another light: not shown", icon="ERROR")
+                layout.label(text="Glossy bounces are of another light or lobe: not shown", icon="ERROR")
 
 
 class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):

@@ -11,7 +11,7 @@ from ..backend import spherical_harmonics as sh
 from ..backend.record import BakeRecord
 from ..backend.texture import CHANNELS
 from .gloss_bounce import bounces_for
-from .gloss_nodes import build_gloss_group, gloss_image_count, gloss_images
+from .gloss_nodes import build_gloss_group, gloss_image_count, gloss_images, lobe_of
 from .images import BOUNCED, RECORD, bake_images
 
 _transfer: dict[tuple[int, ...], NDArray[np.float32]] = {}  # images' session uids -> (texels, terms); the last one only
@@ -22,8 +22,8 @@ def can_gloss(record: BakeRecord) -> bool:
     return record.side > 0 and record.colours == 1
 
 
-def gloss_group(data: bpy.types.Mesh, record: BakeRecord) -> bpy.types.NodeTree:
-    """A new group and images for the glossy preview of a bake; dark until `light_gloss`."""
+def gloss_group(data: bpy.types.Mesh, record: BakeRecord, lobe: str) -> bpy.types.NodeTree:
+    """A new group and images for the glossy preview of a bake, of a lobe (`lobes`); dark until `light_gloss`."""
     images = []
     for number in range(gloss_image_count(record.order)):
         image = bpy.data.images.new(f"{data.name} PRT gloss {number}", record.side, record.side, alpha=True,
@@ -31,7 +31,7 @@ def gloss_group(data: bpy.types.Mesh, record: BakeRecord) -> bpy.types.NodeTree:
         image.use_half_precision, image.alpha_mode = False, "CHANNEL_PACKED"
         image[RECORD] = ""
         images.append(image)
-    return build_gloss_group(record.order, images, record.uv_map)
+    return build_gloss_group(record.order, images, record.uv_map, lobe)
 
 
 def light_gloss(data: bpy.types.Mesh, record: BakeRecord, node: bpy.types.Node, light: NDArray, turn: NDArray) -> None:
@@ -49,7 +49,7 @@ def light_gloss(data: bpy.types.Mesh, record: BakeRecord, node: bpy.types.Node, 
     images = gloss_images(node.node_tree)
     numbers = np.empty((len(images), len(transfer), CHANNELS), np.float32)
     gloss.lit_channels(transfer, light, CHANNELS, numbers)
-    bounces = bounces_for(data, light)
+    bounces = bounces_for(data, light, lobe_of(node.node_tree))
     if bounces is not None:
         numbers += _bounced(bake_images(data, bounces, BOUNCED), bounces, numbers.shape)
     for image, pixels in zip(images, numbers, strict=True):

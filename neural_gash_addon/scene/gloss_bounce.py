@@ -11,6 +11,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend import lobes
 from ..backend.errors import UserError
 from ..backend.record import BakeRecord
 from .images import BOUNCED, attach, detach
@@ -31,11 +32,12 @@ def finish_key(finish: NDArray) -> str:
 
 
 def write_bounces(data: bpy.types.Mesh, images: Sequence[bpy.types.Image], record: BakeRecord, light: NDArray,
-                  finish: NDArray) -> None:
+                  finish: NDArray, lobe: str) -> None:
     """Make images those of the mesh's glossy bounces, in place of any earlier ones."""
     discard_bounces(data)
     attach(data, images, BOUNCED)
-    data[_STATE] = json.dumps({"record": record.to_json(), "light": light_key(light), "finish": finish_key(finish)})
+    data[_STATE] = json.dumps({"record": record.to_json(), "light": light_key(light), "finish": finish_key(finish),
+                               "lobe": lobe})
 
 
 def discard_bounces(data: bpy.types.Mesh) -> None:
@@ -56,11 +58,11 @@ def bounces_shown(data: bpy.types.Mesh) -> bool:
     return bool(data.get(_SHOWN))
 
 
-def bounces_for(data: bpy.types.Mesh, light: NDArray) -> BakeRecord | None:
-    """The record of the mesh's glossy bounces where they are of this light (K, 3); noted for `bounces_shown`."""
+def bounces_for(data: bpy.types.Mesh, light: NDArray, lobe: str) -> BakeRecord | None:
+    """The record of the mesh's glossy bounces where they are of this light (K, 3) and lobe; for `bounces_shown`."""
     state = _state(data)
     found = None
-    if state is not None and state["light"] == light_key(light):
+    if state is not None and state["light"] == light_key(light) and state.get("lobe", lobes.GGX) == lobe:
         try:
             found = BakeRecord.from_json(state["record"])
         except UserError:

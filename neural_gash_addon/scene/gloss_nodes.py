@@ -20,7 +20,7 @@ from ..backend import spherical_harmonics as sh
 from ..backend.texture import CHANNELS
 
 _GLOSS, _VERSION = "neural_gash_gloss", 1   # custom property of the group: its version
-_LOBES = "neural_gash_lobes"                # custom property of the image that holds attenuation by roughness
+_LOBES = "neural_gash_lobes"                # custom property of the image of attenuation by roughness: its lobe
 _LOBE_STEPS = 1024
 SPECULAR = 0.04                             # reflectance of a plain dielectric, facing
 
@@ -42,7 +42,15 @@ def gloss_images(group: bpy.types.NodeTree) -> list[bpy.types.Image]:
     return [node.image for node in group.nodes if node.type == "TEX_IMAGE" and node.image and _LOBES not in node.image]
 
 
-def build_gloss_group(order: int, images: Sequence[bpy.types.Image], uv_map: str) -> bpy.types.NodeTree:
+def lobe_of(group: bpy.types.NodeTree) -> str:
+    """The lobe that a group's material has."""
+    found = {node.image[_LOBES] for node in group.nodes if node.type == "TEX_IMAGE" and node.image
+             and _LOBES in node.image}
+    return lobes.PHONG if lobes.PHONG in found else lobes.GGX
+
+
+def build_gloss_group(order: int, images: Sequence[bpy.types.Image], uv_map: str, lobe: str = lobes.GGX
+                      ) -> bpy.types.NodeTree:
     """A new group for one bake.
 
     Inputs: Albedo and Specular (colours), Roughness, and Turn X, Y, Z: rows of the turn into the
@@ -59,7 +67,7 @@ def build_gloss_group(order: int, images: Sequence[bpy.types.Image], uv_map: str
     inputs = graph.node("NodeGroupInput").outputs
     numbers = _numbers(graph, images, uv_map)
     direction = _mirrored(graph, inputs)
-    bands = _attenuation(graph, inputs["Roughness"], order)
+    bands = _attenuation(graph, inputs["Roughness"], order, lobe)
     total: Socket | None = None
     for k, value in enumerate(_harmonics(graph, direction, order)):
         damped = graph.math("MULTIPLY", value, bands[math.isqrt(k)])
@@ -141,10 +149,10 @@ def _mirrored(graph: _Graph, inputs) -> tuple[Socket, Socket, Socket]:
     return x, y, z
 
 
-def _attenuation(graph: _Graph, roughness: Socket, order: int) -> list[Socket | float]:
+def _attenuation(graph: _Graph, roughness: Socket, order: int, lobe: str) -> list[Socket | float]:
     """Attenuation of each band, looked up in an image."""
     texture = graph.node("ShaderNodeTexImage")
-    texture.image, texture.interpolation, texture.extension = _lobe_image(), "Linear", "EXTEND"
+    texture.image, texture.interpolation, texture.extension = _lobe_image(lobe), "Linear", "EXTEND"
     # texel centres are at (i + 0.5) / steps
     u = graph.math("MULTIPLY_ADD", roughness, (_LOBE_STEPS - 1) / _LOBE_STEPS, 0.5 / _LOBE_STEPS)
     graph.group.links.new(graph.join([u]), texture.inputs["Vector"])
@@ -153,16 +161,16 @@ def _attenuation(graph: _Graph, roughness: Socket, order: int) -> list[Socket | 
     return [1.0, *split.outputs, texture.outputs["Alpha"]][:order]
 
 
-def _lobe_image() -> bpy.types.Image:
-    """Attenuation of bands 1 to 4 of the GGX lobe, for roughness 0 to 1."""
-    image = next((i for i in bpy.data.images if _LOBES in i), None)
+def _lobe_image(lobe: str) -> bpy.types.Image:
+    """Attenuation of bands 1 to 4 of a lobe, for roughness 0 to 1."""
+    image = next((i for i in bpy.data.images if i.get(_LOBES) == lobe), None)
     if image is None:
-        image = bpy.data.images.new("PRT lobes", _LOBE_STEPS, 1, alpha=True, float_buffer=True, is_data=True)
+        image = bpy.data.images.new(f"PRT lobes {lobe}", _LOBE_STEPS, 1, alpha=True, float_buffer=True, is_data=True)
         image.use_half_precision, image.alpha_mode = False, "CHANNEL_PACKED"
-        values = lobes.ggx_attenuation(np.linspace(0, 1, _LOBE_STEPS), sh.MAX_ORDER)[:, 1:]
+        values = lobes.attenuation(np.linspace(0, 1, _LOBE_STEPS), sh.MAX_ORDER, lobe)[:, 1:]
         image.pixels.foreach_set(values.astype(np.float32).ravel())
         image.pack()
-        image[_LOBES] = True
+        image[_LOBES] = lobe
     return image
 
 

@@ -85,7 +85,7 @@ def show_gloss(scene: bpy.types.Scene) -> None:
     for obj in scene.objects:
         if is_on(obj) and has_bake(obj) and not obj.library:
             try:
-                preview_on(obj, scene.neural_gash.gloss)
+                preview_on(obj, scene.neural_gash.lobe_shown())
             except UserError:
                 continue  # a damaged bake keeps the preview it has; the panel says so
     apply_light(scene)

@@ -39,11 +39,11 @@ def is_glossy(obj: bpy.types.Object | None) -> bool:
     return obj is not None and any(is_gloss(node.node_tree) for node in _group_nodes(obj))
 
 
-def preview_on(obj: bpy.types.Object, glossy: bool = False) -> None:
+def preview_on(obj: bpy.types.Object, lobe: str = "") -> None:
     """Show the bake of `obj`, lit by a white sky (glossy: dark) until `update_light`.
 
     Args:
-        glossy: also the light that its materials mirror, where the bake allows that.
+        lobe: with which its materials mirror light (`lobes`), where the bake allows that; '' for a dull preview.
     Raises:
         UserError: there is no bake, its images are not whole, or a material's colour reads more
             attributes than EEVEE can draw beside the bake's.
@@ -55,8 +55,8 @@ def preview_on(obj: bpy.types.Object, glossy: bool = False) -> None:
     if images and record.uv_map not in obj.data.uv_layers:
         raise UserError(f"The UV map '{record.uv_map}' of the bake of '{obj.name}' is gone; bake again.")
     preview_off(obj)
-    if glossy and can_gloss(record):
-        group = gloss_group(obj.data, record)
+    if lobe and can_gloss(record):
+        group = gloss_group(obj.data, record, lobe)
     else:
         group = ensure_group(record.order, record.colours, images, record.uv_map if images else "")
     originals = [slot.material for slot in obj.material_slots] or [None]

@@ -137,6 +137,25 @@ def test_phong_takes_arrays_and_a_mirror():
     assert (np.diff(many, axis=1) >= -1e-15)[..., :2].all()
 
 
+@pytest.mark.parametrize("roughness", [0.05, 0.1, 0.2, 0.3])
+def test_a_phong_lobe_is_as_wide_as_half_vectors_make_it(roughness):
+    """Half vectors h ~ cos(h)**N cos(h) with N = 2/alpha**2 - 2: the mean of 1 - cos of the angle between r and w."""
+    power = 2 / roughness ** 4 - 2
+    weight, spread = (quad(lambda h, f=f: f(h) * np.cos(h) ** (power + 1) * np.sin(h), 0, np.pi / 2,
+                           points=[roughness ** 2, 5 * roughness ** 2])[0]
+                      for f in (lambda h: 1, lambda h: 1 - np.cos(2 * h)))
+    spread /= weight
+    found = 1 - lobes.attenuation(roughness, 2, lobes.PHONG)[1]
+    assert abs(found / spread - 1) < 2 * roughness ** 4 + 1e-6   # alike as long as the lobe is narrow
+
+
+def test_roughness_gives_every_exponent():
+    for exponent in EXPONENTS:
+        np.testing.assert_allclose(lobes.phong_exponent((2 * exponent + 1) ** -0.25), exponent, rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(lobes.phong_exponent([-1.0, 0.0, 1.0, 2.0]), [np.inf, np.inf, 0, 0])
+    np.testing.assert_array_equal(lobes.attenuation([0.0, 0.4], 5), lobes.ggx_attenuation([0.0, 0.4], 5))
+
+
 def ggx_moment(roughness, band):
     """E[P_l(cos 2 theta_h)] for half vectors of density D(h) cos(theta_h)."""
     alpha2 = max(roughness, 1e-3) ** 4

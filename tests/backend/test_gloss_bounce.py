@@ -49,9 +49,11 @@ def test_nothing_glossy_is_the_diffuse_bounce():
         assert error < 0.04 and truth.max() > 0.05, error   # rays of their own: noise of 512
 
 
-@pytest.mark.parametrize("roughness", [None, 0.0])
-def test_equals_its_slow_twin(roughness):
-    finish = Finish(ALBEDO, SPECULAR, ROUGHNESS if roughness is None else np.full(6, roughness))
+@pytest.mark.parametrize(("roughness", "lobe"), [(None, lobes.GGX), (0.0, lobes.GGX), (None, lobes.PHONG)])
+def test_equals_its_slow_twin(roughness, lobe):
+    finish = Finish(ALBEDO, SPECULAR, ROUGHNESS if roughness is None else np.full(6, roughness), lobe)
+    attenuation = {lobes.GGX: lobes.ggx_attenuation,
+                   lobes.PHONG: lambda r, order: lobes.phong_attenuation((r ** -4 - 1) / 2, order)}[lobe]
     mesh, scene = points_on_floor(6), Occluders([(CORNERS, FACES)])
     found = methods.run(solved(finish, 1).gather(mesh, 4096))
     local = sampling.hemisphere_sets(1, 1024, 7)[0]
@@ -69,7 +71,7 @@ def test_equals_its_slow_twin(roughness):
         transfer = methods.run(methods.bake(there, "embree", ORDER, rays=256)).coefficients
         arriving = gloss.transferred(transfer, LIGHT)
         glossy = gloss.reflected_radiance(arriving, -w[hits.rays], normal,
-                                          lobes.ggx_attenuation(finish.roughness[hits.faces], ORDER))
+                                          attenuation(finish.roughness[hits.faces], ORDER))
         radiance = finish.specular[hits.faces] * glossy + finish.albedo[hits.faces] * (transfer @ LIGHT)
         truth[n] = np.pi * np.einsum("rk,rc->kc", sh.evaluate(w[hits.rays], ORDER), radiance) / len(w)
     error = np.sqrt(np.square(found - truth).sum() / np.square(truth).sum())

@@ -34,9 +34,27 @@ def test_options_that_do_not_fit_are_refused(refused, blend, tmp_path):
     out = tmp_path / "out.blend"
     assert "--texture" in refused("bake", blend, "--object", "Ring", "--half", "--out", out)
     assert "--npz" in refused("bake", blend, "--object", "Ring", "--texture", 64, "--npz", tmp_path / "a.npz")
+    assert "--texture" in refused("bake", blend, "--object", "Ring", "--gloss", "ggx", "--out", out)
     assert "resolution" in refused("bake", blend, "--object", "Ring", "--texture", 5, "--out", out)
     assert "no UV map" in refused("bake", blend, "--object", "Ring", "--texture", 64, "--uv-map", "X", "--out", out)
     assert not list(tmp_path.iterdir())
+
+
+def test_gloss(run, blend, tmp_path, exr):
+    done = run("bake", blend, "--object", "Ring", "--texture", 32, "--rays", 4, "--gloss", "phong",
+               "--out", tmp_path / "out.blend", "--png", tmp_path / "baked.exr")
+    assert done.returncode == 0, done.stderr
+    pictures = {}
+    for gloss in ("", "ggx", "phong"):
+        to = tmp_path / f"{gloss or 'dull'}.exr"
+        done = run("relight", tmp_path / "out.blend", "--object", "Ring", "--png", to,
+                   *(("--gloss", gloss) if gloss else ()))
+        assert done.returncode == 0, done.stderr
+        pictures[gloss] = exr(to)[..., :3]
+    baked = exr(tmp_path / "baked.exr")[..., :3]
+    np.testing.assert_allclose(pictures["phong"], baked, atol=5e-3)
+    added = pictures["phong"] - pictures[""]
+    assert added.mean() > 1e-3 and np.abs(pictures["ggx"] - pictures["phong"]).max() > 1e-3
 
 
 @pytest.mark.parametrize("kills", [2])

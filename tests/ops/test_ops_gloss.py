@@ -8,7 +8,8 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 FLOOR = ([(-2, -2, 0), (2, -2, 0), (2, 2, 0), (-2, 2, 0)], [(0, 1, 2, 3)])
-ALBEDO, SIZE = np.array([0.5, 0.4, 0.3]), 48
+ALBEDO, SIZE, ANGLE = np.array([0.5, 0.4, 0.3]), 48, 0.9
+VARYING = 0.2, 0.5  # slope along x, and roughness at 0
 
 
 @pytest.fixture
@@ -36,47 +37,73 @@ def _light(seed=0):
 
 def _camera():
     camera = bpy.data.objects.new("Eye", bpy.data.cameras.new("Eye"))
-    camera.location, camera.data.angle = (0, 0, 3), 0.9
+    camera.location, camera.data.angle = (0, 0, 3), ANGLE
     bpy.context.scene.collection.objects.link(camera)
     bpy.context.view_layer.update()
     return camera
 
 
-def _expected(normal, light, roughness, metallic):
-    """(SIZE, SIZE, 3) radiance of a plane through the origin, seen by the camera at (0, 0, 3); row 0 at the bottom."""
+def _expected(normal, light, roughness, metallic, lobe="GGX"):
+    """(SIZE, SIZE, 3) radiance of a plane through the origin, seen by the camera at (0, 0, 3); row 0 at the bottom.
+
+    Args:
+        roughness: a number, or None for VARYING of a plane in z = 0.
+    """
     from neural_gash_addon.backend import gloss, lobes, shading
     from neural_gash_addon.backend import spherical_harmonics as sh
-    half = np.tan(0.45)
+    half = np.tan(ANGLE / 2)
     line = (np.arange(SIZE) + 0.5) / SIZE * 2 - 1
     x, y = np.meshgrid(line * half, line * half)
+    if roughness is None:
+        roughness = VARYING[0] * 3 * x.ravel() + VARYING[1]
+    roughness = np.asarray(roughness)
+    bands = lobes.ggx_attenuation(roughness, 5) if lobe == "GGX" else \
+        lobes.phong_attenuation((roughness ** -4 - 1) / 2, 5)
     view = -np.stack([x, y, -np.ones_like(x)], -1).reshape(-1, 3)
     view /= np.linalg.norm(view, axis=1, keepdims=True)
     normals = np.tile(normal, (len(view), 1))
     transfer = sh.cosine_lobe(normals, 5)
-    glossy = gloss.reflected_radiance(gloss.transferred(transfer, light), view, normals,
-                                      lobes.ggx_attenuation(roughness, 5))
+    glossy = gloss.reflected_radiance(gloss.transferred(transfer, light), view, normals, bands)
     mirrored = 0.04 + metallic * (ALBEDO - 0.04)
     return (shading.radiance(transfer, light, ALBEDO * (1 - metallic)) + mirrored * glossy).reshape(SIZE, SIZE, 3)
 
 
-@pytest.mark.parametrize(("roughness", "metallic", "tilt"), [(0.3, 1.0, 0), (0.7, 0.0, 0), (0.5, 0.6, 0.3)])
-def test_pixels_equal_numpy(shiny, roughness, metallic, tilt):
+def _vary(material, socket):
+    """Link a roughness that rises along x."""
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    place, split, rise = (nodes.new(f"ShaderNode{kind}") for kind in ("NewGeometry", "SeparateXYZ", "Math"))
+    rise.operation = "MULTIPLY_ADD"
+    rise.inputs[1].default_value, rise.inputs[2].default_value = VARYING
+    links.new(place.outputs["Position"], split.inputs[0])
+    links.new(split.outputs["X"], rise.inputs[0])
+    links.new(rise.outputs[0], socket)
+
+
+@pytest.mark.parametrize(("roughness", "metallic", "tilt", "lobe"), [
+    (0.3, 1.0, 0, "GGX"), (0.7, 0.0, 0, "GGX"), (0.5, 0.6, 0.3, "GGX"), (None, 1.0, 0, "GGX"),
+    (0.3, 1.0, 0, "PHONG"), (0.8, 0.0, 0, "PHONG"), (0.5, 0.6, 0.3, "PHONG"), (None, 1.0, 0, "PHONG")])
+def test_pixels_equal_numpy(shiny, settings, roughness, metallic, tilt, lobe):
     from neural_gash_addon.scene.render import render_pixels
     floor, shader = shiny
-    shader.inputs["Roughness"].default_value, shader.inputs["Metallic"].default_value = roughness, metallic
+    settings.lobe = lobe
+    shader.inputs["Metallic"].default_value = metallic
+    if roughness is None:
+        _vary(floor.data.materials[0], shader.inputs["Roughness"])
+    else:
+        shader.inputs["Roughness"].default_value = roughness
     assert bpy.ops.neural_gash.bake() == {"FINISHED"}
     floor.rotation_euler = (tilt, -tilt / 2, 1.1 * tilt)   # after the bake: the light turns into its frame
     bpy.context.view_layer.update()
     light = _light()
     normal = np.array(floor.matrix_world.to_3x3()) @ [0, 0, 1]
     picture = render_pixels([floor], camera=_camera(), resolution=(SIZE, SIZE), samples=256)[::-1, :, :3]
-    expected = _expected(normal, light, roughness, metallic)
-    dull = _expected(normal, light, roughness, metallic) - _expected(normal, light, 1.0, metallic)
+    expected = _expected(normal, light, roughness, metallic, lobe)
     inner = (slice(8, -8), slice(8, -8))
-    assert np.abs(dull[inner]).max() > 0.01
+    other = _expected(normal, light, roughness, metallic, {"GGX": "PHONG", "PHONG": "GGX"}[lobe])
+    for wrong in (_expected(normal, light, 1.0, metallic, lobe), other):
+        assert np.abs(expected - wrong)[inner].max() > 1e-2 * np.abs(expected).max()
     # pixels average smooth radiance over their filter, by chance: 256 samples leave a little
-    assert np.abs(picture - expected)[inner].max() < 1e-2 * np.abs(expected).max()
-    assert np.abs(picture - expected)[inner].mean() < 1e-3 * np.abs(expected).max()
+    assert np.abs(picture - expected)[inner].max() < 1e-3 * np.abs(expected).max()
 
 
 def test_light_changes_fill_the_images_and_nothing_else(shiny, settings):
@@ -102,6 +129,27 @@ def test_light_changes_fill_the_images_and_nothing_else(shiny, settings):
     assert names == [len(getattr(bpy.data, kind)) for kind in ("images", "materials", "node_groups")]
 
 
+def test_another_lobe_shows_at_once_and_leaves_nothing_behind(shiny, settings):
+    from neural_gash_addon.scene.gloss_nodes import lobe_of
+    floor, _ = shiny
+    bpy.ops.neural_gash.bake()
+    _light()
+
+    def group():
+        return next(n.node_tree for s in floor.material_slots for n in s.material.node_tree.nodes if n.type == "GROUP")
+
+    assert lobe_of(group()) == "GGX"
+    count = [len(getattr(bpy.data, kind)) for kind in ("materials", "node_groups")]
+    settings.lobe = "PHONG"
+    assert lobe_of(group()) == "PHONG"
+    assert [len(getattr(bpy.data, kind)) for kind in ("materials", "node_groups")] == count
+    for action in (bpy.ops.neural_gash.preview, bpy.ops.neural_gash.preview, bpy.ops.neural_gash.bake):
+        action()
+    assert lobe_of(group()) == "PHONG"
+    settings.lobe = "GGX"
+    assert lobe_of(group()) == "GGX" and len([i for i in bpy.data.images if "gloss" in i.name]) == 20
+
+
 def test_turned_off_and_cleared_leaves_nothing(shiny, settings):
     floor, _ = shiny
     before = sorted(i.name for i in bpy.data.images), sorted(g.name for g in bpy.data.node_groups)
@@ -112,7 +160,7 @@ def test_turned_off_and_cleared_leaves_nothing(shiny, settings):
     settings.gloss = True
     assert [g for g in bpy.data.node_groups if "Gloss" in g.name]
     bpy.ops.neural_gash.clear()
-    images = sorted(i.name for i in bpy.data.images if i.name != "PRT lobes")
+    images = sorted(i.name for i in bpy.data.images if not i.name.startswith("PRT lobes"))
     after = images, sorted(g.name for g in bpy.data.node_groups)
     assert after == before
     assert [s.material and s.material.name for s in floor.material_slots] == ["Shiny"]

@@ -80,6 +80,24 @@ def test_another_light_leaves_them_out_and_the_same_one_shows_them(room, setting
     assert bounces_shown(floor.data)
 
 
+def test_another_lobe_leaves_them_out(room, settings):
+    from neural_gash_addon.scene.gloss_bounce import bounces_shown
+    from neural_gash_addon.scene.staleness import CURRENT, status
+    floor, _, _ = room
+    direct = _numbers(floor)
+    assert bpy.ops.neural_gash.bake_gloss() == {"FINISHED"}
+    ggx = _numbers(floor) - direct
+    settings.lobe = "PHONG"
+    assert not bounces_shown(floor.data) and status(floor) == CURRENT
+    np.testing.assert_array_equal(_numbers(floor), direct)
+    assert bpy.ops.neural_gash.bake_gloss() == {"FINISHED"}
+    phong = _numbers(floor) - direct
+    assert bounces_shown(floor.data) and np.abs(phong).max() > 0.01
+    assert np.abs(phong - ggx).max() > 1e-3 * np.abs(ggx).max()   # the wall is rough: what it mirrors differs little
+    settings.lobe = "GGX"
+    assert not bounces_shown(floor.data)
+
+
 def test_another_roughness_makes_them_stale(room):
     from neural_gash_addon.scene.staleness import CURRENT, STALE, status
     floor, wall, shader = room
