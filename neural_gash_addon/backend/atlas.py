@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from .errors import UserError
 from .geometry import Surface
 from .progress import scaled
-from .raster import CHECKED_SIDE, Layout
+from .raster import CHECKED_SIDE, Layout, check_range
 from .resolution import MAX_FIT, Trial, fitting_density
 from .unwrap import Atlas, Charts, cut, lay_out
 
@@ -26,6 +26,16 @@ class Part:
     uv: NDArray | None = None   # (C, 2) of each face corner that it has already
     trial: Trial | None = None  # where the error decides how fine the texture is: `resolution.fitting_side` of the mesh
     name: str = ""              # to tell meshes apart in messages
+
+
+def check_part(part: Part) -> None:
+    """UserError for a mesh that no texture has room for, whatever else is in it."""
+    if part.uv is not None:
+        check_range(part.uv[part.surface.corners])
+        return
+    places = part.surface.positions[part.surface.triangles]
+    if not np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]).any():
+        raise UserError("All faces have an area of zero, so a texture has nothing to show; bake to vertices.")
 
 
 def place(parts: Sequence[Part], *, side: int | None = None, texels_per_metre: float | None = None, padding: int = 2,
@@ -44,6 +54,8 @@ def place(parts: Sequence[Part], *, side: int | None = None, texels_per_metre: f
     Raises:
         UserError: sizes out of range, UVs outside the texture or missing room, faces that overlap.
     """
+    for part in parts:
+        check_part(part)
     trials = [part.trial for part in parts if part.trial is not None]
     if not trials:
         _check_side(side, texels_per_metre if parts[0].uv is None else None)

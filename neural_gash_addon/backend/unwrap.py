@@ -285,7 +285,7 @@ def _pack(xatlas, local: NDArray, pieces: list[NDArray[np.int64]], side: int | N
             break
         scale *= min(_SHRINK, 1.3 / max(1, atlas.atlas_count) ** 0.5)
     else:
-        raise UserError(f"A texture of {side} x {side} is too small for the {atlas.chart_count:,} charts of this mesh; "
+        raise UserError(f"A texture of {side} x {side} is too small for the charts of this mesh; "
                         "choose a higher resolution or a smaller padding.")
     out = np.empty_like(local)
     size = np.array([atlas.width, atlas.height]) / side
