@@ -74,6 +74,14 @@ class Atlas:
     single_faces: int        # faces that were laid out alone, as xatlas could not chart them
 
 
+def least_side(charts: Charts, texels_per_metre: float) -> float:
+    """Texels a side that no packing of the charts stays below: their area, and the longest edge as a diagonal."""
+    places = charts.positions[charts.triangles]
+    edges = places - np.roll(places, 1, 1)
+    area = 0.5 * float(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum())
+    return texels_per_metre * max(area ** 0.5, (0.5 * float(np.square(edges).sum(2).max(initial=0.0))) ** 0.5)
+
+
 def unwrap(surface: Surface, *, side: int | None, texels_per_metre: float | None = None, padding: int = 2,
            ) -> Generator[float, None, Atlas]:
     """`cut` and `lay_out` in one."""

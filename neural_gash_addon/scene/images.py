@@ -84,6 +84,8 @@ def bake_images(data: bpy.types.Mesh, record: BakeRecord, key: str = TRANSFER) -
             text, _, _ = exr.read_record(path)
             if text != image.get(RECORD):
                 raise UserError(f"The file '{path}' is of another bake than the object's; bake again.")
+        if not all(image.size):
+            raise UserError(f"The image '{image.name}' of the bake cannot be read ('{image.filepath}'); bake again.")
         if tuple(image.size) != (record.side, record.side):
             raise UserError(f"The image '{image.name}' has {image.size[0]} x {image.size[1]} texels, "
                             f"but the bake has {record.side} x {record.side}; bake again.")

@@ -49,8 +49,14 @@ def write_own_uv(data: bpy.types.Mesh, uv: NDArray) -> str:
         data.uv_layers.active = data.uv_layers[names[0]]
     if names[1]:
         data.uv_layers[names[1]].active_render = True
-    data[_OWN] = own
+    mark_own_uv(data, own)
     return own
+
+
+def mark_own_uv(data: bpy.types.Mesh, name: str) -> None:
+    """Say that a bake made the UV map of this name; '': none."""
+    if name:
+        data[_OWN] = name
 
 
 def remove_own_uv(data: bpy.types.Mesh) -> None:

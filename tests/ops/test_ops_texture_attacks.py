@@ -179,3 +179,46 @@ def test_glossy_bounces_in_edit_mode_are_refused_by_that(make, texture, refused)
     bpy.ops.object.mode_set(mode="EDIT")
     assert "Edit Mode" in refused(bpy.ops.neural_gash.bake_gloss)
     bpy.ops.object.mode_set(mode="OBJECT")
+
+
+@pytest.mark.parametrize("density", [1e5, 1e12, 0.1])
+def test_densities_that_no_texture_has_are_refused(make, texture, refused, density):
+    texture.sizing, texture.texels_per_metre = "DENSITY", density
+    make(*FLOOR)
+    sentence = refused(bpy.ops.neural_gash.bake)  # Blender died of the large ones
+    assert "choose fewer texels" in sentence if density > 1 else "choose more texels" in sentence
+
+
+def test_glossy_previews_whose_images_were_deleted_get_new_ones(make, texture):
+    texture.gloss = True
+    bpy.context.scene.world = bpy.data.worlds.new("Sky")
+    _bake(make(*FLOOR))
+    for image in [i for i in bpy.data.images if "gloss" in i.name]:
+        bpy.data.images.remove(image)
+    bpy.ops.neural_gash.light_from_world()
+    texture.light_rotation = 0.5
+    lit = [i for i in bpy.data.images if "gloss" in i.name]
+    assert len(lit) == 8 and any(_pixels(i).any() for i in lit)
+
+
+def test_an_applied_copy_does_not_keep_the_uv_map_of_an_earlier_bake(make, texture):
+    obj = make()
+    _bake(obj)
+    obj.modifiers.new("Finer", "SUBSURF")
+    bpy.context.view_layer.update()
+    assert bpy.ops.neural_gash.bake_applied_copy() == {"FINISHED"}
+    assert [u.name for u in bpy.context.object.data.uv_layers] == ["PRT"]
+    bpy.ops.neural_gash.clear()
+    assert not bpy.context.object.data.uv_layers and [u.name for u in obj.data.uv_layers] == ["PRT"]
+
+
+def test_a_file_cut_short_is_said_to_be_unreadable(make, texture, refused, tmp_path):
+    texture.texture_folder = str(tmp_path)
+    _bake(make(*LID))
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    for path in tmp_path.glob("*.exr"):
+        path.write_bytes(path.read_bytes()[:-20])
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.neural_gash.preview()
+    assert "cannot be read" in refused(bpy.ops.neural_gash.preview)
+    assert bpy.ops.neural_gash.bake() == {"FINISHED"}
