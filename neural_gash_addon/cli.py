@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import io
 import json
 import math
@@ -96,7 +97,10 @@ def _parser() -> argparse.ArgumentParser:
 
 def _side(text: str) -> int | str:
     """A number of texels, or 'fit'."""
-    return text if text == "fit" else int(text)
+    try:
+        return text if text == "fit" else int(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"'{text}' is neither a number of texels nor 'fit'") from error
 
 
 def main(argv: Sequence[str]) -> int:
@@ -196,6 +200,8 @@ def _tiles(arguments: argparse.Namespace, obj: bpy.types.Object) -> Path | None:
     if arguments.texture is None or output is None:
         return None
     clean = "".join(c if c.isalnum() else "_" for c in obj.name)
+    if clean != obj.name:  # others' names may be the same but for what was replaced
+        clean += "-" + hashlib.blake2b(obj.name.encode(), digest_size=4).hexdigest()
     return output.absolute().parent / f".{output.stem}-{clean}.tiles"
 
 

@@ -97,7 +97,7 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
         name="Rotation", default=0.0, subtype="ANGLE", soft_min=-math.pi, soft_max=math.pi,
         description="Turn the light of the previews about the vertical axis", update=_light_changed)
     light_strength: FloatProperty(  # type: ignore[valid-type]
-        name="Strength", default=1.0, min=0.0, soft_max=10.0,
+        name="Strength", default=1.0, min=0.0, max=1e9, soft_max=10.0,
         description="Brighten or dim the light of the previews", update=_light_changed)
     gloss: BoolProperty(  # type: ignore[valid-type]
         name="Glossy", default=False, update=_gloss_changed,

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from .errors import UserError
 from .geometry import Surface
 from .progress import scaled
-from .raster import CHECKED_SIDE, Layout
+from .raster import CHECKED_SIDE, Layout, check_range
 from .resolution import MAX_FIT, Trial, fitting_density
-from .unwrap import Atlas, Charts, cut, lay_out
+from .unwrap import Atlas, Charts, cut, lay_out, least_side
 
 MIN_SIDE, MAX_SIDE = 16, 8192
 
@@ -26,6 +26,16 @@ class Part:
     uv: NDArray | None = None   # (C, 2) of each face corner that it has already
     trial: Trial | None = None  # where the error decides how fine the texture is: `resolution.fitting_side` of the mesh
     name: str = ""              # to tell meshes apart in messages
+
+
+def check_part(part: Part) -> None:
+    """UserError for a mesh that no texture has room for, whatever else is in it."""
+    if part.uv is not None:
+        check_range(part.uv[part.surface.corners])
+        return
+    places = part.surface.positions[part.surface.triangles]
+    if not np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]).any():
+        raise UserError("All faces have an area of zero, so a texture has nothing to show; bake to vertices.")
 
 
 def place(parts: Sequence[Part], *, side: int | None = None, texels_per_metre: float | None = None, padding: int = 2,
@@ -44,6 +54,8 @@ def place(parts: Sequence[Part], *, side: int | None = None, texels_per_metre: f
     Raises:
         UserError: sizes out of range, UVs outside the texture or missing room, faces that overlap.
     """
+    for part in parts:
+        check_part(part)
     trials = [part.trial for part in parts if part.trial is not None]
     if not trials:
         _check_side(side, texels_per_metre if parts[0].uv is None else None)
@@ -65,18 +77,31 @@ def place(parts: Sequence[Part], *, side: int | None = None, texels_per_metre: f
     if trials:
         atlas = yield from scaled(_fitted(joined, padding), 0.8, 0.2)
     else:
+        if side is None:
+            _check_density(least_side(joined, texels_per_metre or 1.0), 0)  # xatlas dies of what memory cannot hold
         laying = lay_out(joined, side=side, texels_per_metre=texels_per_metre, padding=padding)
         atlas = yield from scaled(laying, 0.8, 0.2)
-        _check_side(atlas.side, None)
+        if side is None:
+            _check_density(atlas.side, MIN_SIDE)
     return np.split(atlas.uv, np.cumsum([c.corner_count for c in charts])[:-1]), atlas.side
 
 
 def _fitted(charts: Charts, padding: int) -> Generator[float, None, Atlas]:
     """Charts measured in texels, in a texture as large as that takes, within what an error may ask for."""
+    if least_side(charts, 1.0) > MAX_FIT:
+        return (yield from lay_out(charts, side=MAX_FIT, padding=padding))
     atlas = yield from lay_out(charts, side=None, texels_per_metre=1.0, padding=padding)
     if not MIN_SIDE <= atlas.side <= MAX_FIT:
         atlas = yield from lay_out(charts, side=MIN_SIDE if atlas.side < MIN_SIDE else MAX_FIT, padding=padding)
     return atlas
+
+
+def _check_density(side: float, least: int) -> None:
+    """UserError unless a density gives a texture that can be baked."""
+    if not least <= side <= MAX_SIDE:
+        choose = "fewer" if side > MAX_SIDE else "more"
+        raise UserError(f"At this density the texture would have {side:,.0f} texels a side, and {MIN_SIDE} to "
+                        f"{MAX_SIDE} can be baked; choose {choose} texels per metre.")
 
 
 def _check_side(side: int | None, texels_per_metre: float | None) -> None:

@@ -34,6 +34,14 @@ def check_writable(path: Path) -> None:
         raise UserError(f"The folder '{path.parent}' cannot be written to ({reason(error)}).") from error
 
 
+def check_folder(folder: Path) -> None:
+    """UserError unless there is such a folder that can be written to, or one can be made."""
+    there = next(path for path in (folder, *folder.parents) if os.path.exists(path))
+    if not there.is_dir():
+        raise UserError(f"The folder '{folder}' cannot be made, as '{there}' is a file.")
+    check_writable(there / "draft")
+
+
 def reason(error: OSError) -> str:
     """Why a file could not be read or written, for the end of a sentence."""
     return (error.strerror or str(error)).lower()

@@ -10,6 +10,7 @@ import struct
 import zlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ _CHANNELS = "ABGR"        # the format wants them by name; of an (H, W, 4) image
 _HALF, _FLOAT = 1, 2
 _ZIP = 3
 _ROWS = 16                # of a block, by the format
+_LONGEST_NAME = 255       # by the format
 _LEVEL = 4                # of zlib: more takes far longer for a few per cent
 
 
@@ -63,7 +65,7 @@ def read_record(path: Path) -> tuple[str, int, int]:
     """
     try:
         with path.open("rb") as file:
-            attributes = _attributes(file.read(1 << 16))
+            attributes = _attributes(file)
     except OSError as error:
         raise UserError(f"'{path}' cannot be read ({reason(error)}).") from error
     except (ValueError, struct.error) as error:
@@ -89,18 +91,31 @@ def _header(width: int, height: int, half: bool, record: str) -> bytes:
         for name, kind, value in values) + b"\0"
 
 
-def _attributes(data: bytes) -> dict[str, bytes]:
-    """The attributes of a header. Raises ValueError or struct.error where it is none."""
-    if struct.unpack_from("<i", data)[0] != _MAGIC:
+def _attributes(file: BinaryIO) -> dict[str, bytes]:
+    """The attributes of a header, which is long where many objects shadow each other.
+
+    Raises ValueError or struct.error where it is none.
+    """
+    if struct.unpack("<ii", file.read(8))[0] != _MAGIC:
         raise ValueError("magic")
-    found, place = {}, 8
-    while data[place] if place < len(data) else 0:
-        name_end = data.index(b"\0", place)
-        kind_end = data.index(b"\0", name_end + 1)
-        size = struct.unpack_from("<i", data, kind_end + 1)[0]
-        found[data[place:name_end].decode("latin-1")] = data[kind_end + 5:kind_end + 5 + size]
-        place = kind_end + 5 + size
+    found = {}
+    while name := _word(file):
+        _word(file)  # its type
+        size, = struct.unpack("<i", file.read(4))
+        if size < 0:
+            raise ValueError("size")
+        found[name] = file.read(size)
     return found
+
+
+def _word(file: BinaryIO) -> str:
+    """A name in a header; '' at its end. Raises ValueError where it is longer than the format has them."""
+    out = b""
+    while (letter := file.read(1)) not in (b"", b"\0"):
+        out += letter
+        if len(out) > _LONGEST_NAME:
+            raise ValueError("name")
+    return out.decode("latin-1")
 
 
 def _pack(raw: bytes) -> bytes:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from .geometry import INSET, TEXEL, Surface, TriangleMesh, unit
 from .raster import Coverage
 
+_FARTHEST = 1e9      # UVs beyond have no digits left for a place in an image
 _AT_ONCE = 1 << 17  # texels computed at a time, so that memory stays small
 
 
@@ -76,8 +77,9 @@ def _mapped(normal_map: NormalMap, corners: NDArray, weights: NDArray, smooth: N
 
 
 def bilinear(image: NDArray, uv: NDArray) -> NDArray[np.float64]:
-    """Colours (n, 3) of an image (H, W, 3) that repeats, at uv (n, 2)."""
+    """Colours (n, 3) of an image (H, W, 3) that repeats, at uv (n, 2); at 0 where that is no number."""
     height, width = image.shape[:2]
+    uv = np.where(np.abs(uv) < _FARTHEST, uv, 0)
     x, y = uv[:, 0] * width - 0.5, uv[:, 1] * height - 0.5
     column, row = np.floor(x), np.floor(y)
     s, t = (x - column)[:, None], (y - row)[:, None]

@@ -74,6 +74,14 @@ class Atlas:
     single_faces: int        # faces that were laid out alone, as xatlas could not chart them
 
 
+def least_side(charts: Charts, texels_per_metre: float) -> float:
+    """Texels a side that no packing of the charts stays below: their area, and the longest edge as a diagonal."""
+    places = charts.positions[charts.triangles]
+    edges = places - np.roll(places, 1, 1)
+    area = 0.5 * float(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum())
+    return texels_per_metre * max(area ** 0.5, (0.5 * float(np.square(edges).sum(2).max(initial=0.0))) ** 0.5)
+
+
 def unwrap(surface: Surface, *, side: int | None, texels_per_metre: float | None = None, padding: int = 2,
            ) -> Generator[float, None, Atlas]:
     """`cut` and `lay_out` in one."""
@@ -285,9 +293,7 @@ def _pack(xatlas, local: NDArray, pieces: list[NDArray[np.int64]], side: int | N
             break
         scale *= min(_SHRINK, 1.3 / max(1, atlas.atlas_count) ** 0.5)
     else:
-        # where not even one chart had room, xatlas counts none
-        charts = f"{atlas.chart_count:,} charts" if atlas.chart_count else "charts"
-        raise UserError(f"A texture of {side} x {side} is too small for the {charts} of this mesh; "
+        raise UserError(f"A texture of {side} x {side} is too small for the charts of this mesh; "
                         "choose a higher resolution or a smaller padding.")
     out = np.empty_like(local)
     size = np.array([atlas.width, atlas.height]) / side

@@ -71,7 +71,7 @@ def prepare_batch(context: bpy.types.Context, objects: Sequence[bpy.types.Object
         try:
             jobs.append(prepare(context, obj, settings, None if obj is None else tiles(obj), group))
         except UserError as error:
-            refused.append(Outcome("" if obj is None else obj.name, None, str(error)))
+            refused.append(Outcome("" if obj is None else obj.name, None, _named(obj, error, len(objects))))
             continue
         assert obj is not None
         meshes[obj.data.session_uid] = obj.name
@@ -128,15 +128,16 @@ def finish_batch(context: bpy.types.Context, batch: Batch, results: Sequence[Res
     """
     outcomes = list(batch.refused)
     baked: list[tuple[Job, Transfer | TextureTransfer]] = []
+    owners: list[bpy.types.Mesh] = []
     for job, result in zip(batch.jobs, results, strict=True):
         try:
             if isinstance(result, UserError):
                 raise result
             if batch.shared:
-                check(context, job)
+                owners.append(check(context, job).data)
             baked.append((job, result))
         except UserError as error:
-            outcomes.append(Outcome(job.name, None, str(error)))
+            outcomes.append(Outcome(job.name, None, _named(job, error, len(batch.jobs) + len(batch.refused))))
     images: list[bpy.types.Image] = []
     if batch.shared and baked:
         whole = alike([t for _, t in baked if isinstance(t, TextureTransfer)])
@@ -144,16 +145,23 @@ def finish_batch(context: bpy.types.Context, batch: Batch, results: Sequence[Res
         options = baked[0][0].texture
         assert options is not None
         records = {job.name: {"frame": job.frame, "uv_map": options.uv_map} for job, _ in baked}
-        images = make_images(baked[0][0].name, merged(whole), options.folder, options.half, json.dumps(records))
+        images = make_images(baked[0][0].name, merged(whole), options.folder, options.half, json.dumps(records),
+                             owners=owners)
     for job, transfer in baked:
         try:
             outcomes.append(Outcome(job.name, *finish(context, job, transfer, images)))
         except UserError as error:
-            outcomes.append(Outcome(job.name, None, str(error)))
+            outcomes.append(Outcome(job.name, None, _named(job, error, len(batch.jobs) + len(batch.refused))))
     remove_unused(images)
     if all(outcome.record is None for outcome in outcomes):
         raise UserError(outcomes[-1].sentence)
     return outcomes
+
+
+def _named(thing: bpy.types.Object | Job | None, error: UserError, count: int) -> str:
+    """Why one of `count` objects was not baked; it must be clear which."""
+    sentence = str(error)
+    return sentence if thing is None or count == 1 or f"'{thing.name}'" in sentence else f"'{thing.name}': {sentence}"
 
 
 def bake_object(context: bpy.types.Context, obj: bpy.types.Object | None, settings: NeuralGashSettings,

@@ -103,7 +103,8 @@ class NEURAL_GASH_OT_bake_gloss(Baking, bpy.types.Operator):
         if read_record(obj) != job.record or not staleness.same(obj, job.record):
             raise UserError(f"'{obj.name}' or what shadows it was changed during the bake; bake again.")
         images = bake_images(obj.data, job.record)
-        made = make_images(obj.name, transfer, folder_of(images), images[0].use_half_precision, label="prt_gloss")
+        made = make_images(obj.name, transfer, folder_of(images), images[0].use_half_precision, label="prt_gloss",
+                           owners=[obj.data])
         write_bounces(obj.data, made, transfer.record, job.light, job.finish, job.lobe)
         context.scene.neural_gash.gloss = True
         if not is_glossy(obj):

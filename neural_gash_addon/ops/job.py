@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend import methods
-from ..backend.atlas import Part
+from ..backend.atlas import Part, check_part
 from ..backend.bounce import Reflection
 from ..backend.errors import UserError
+from ..backend.exchange import check_folder
 from ..backend.geometry import Surface
 from ..backend.record import VERSION, BakeRecord
 from ..backend.resolution import fitting_side
@@ -134,10 +135,14 @@ def _texture_options(obj: bpy.types.Object, settings: NeuralGashSettings, surfac
     if folder is not None and not folder.is_absolute():
         raise UserError("The folder of the textures is beside a .blend file that has not been saved yet; "
                         "save it first, or leave the folder empty.")
+    if folder is not None:
+        check_folder(folder)
     if uv is None:
         check_room(obj.data)
     trial = partial(fitting_side, surface, error=settings.tolerance, **what) if settings.sizing == FIT else None
-    return TextureOptions(Part(surface, uv, trial, obj.name), uv is None, settings.uv_map, folder, settings.half, tiles)
+    part = Part(surface, uv, trial, obj.name)
+    check_part(part)  # here, as a texture that is shared is placed for all objects at once
+    return TextureOptions(part, uv is None, settings.uv_map, folder, settings.half, tiles)
 
 
 def size(settings: NeuralGashSettings) -> dict:

@@ -75,6 +75,7 @@ def _value(socket: bpy.types.NodeSocket, mesh: bpy.types.Mesh, corners: NDArray)
             uv = np.empty((len(layer.uv), 2), np.float32)
             layer.uv.foreach_get("vector", uv.ravel())
             places = np.einsum("pc,fcx->fpx", _PLACES, uv[corners])
+            pixels = np.nan_to_num(pixels)
             return bilinear(pixels, places.reshape(-1, 2)).reshape(len(corners), len(_PLACES), 3).mean(1)
     return own
 

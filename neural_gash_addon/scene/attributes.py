@@ -97,8 +97,8 @@ def write_textures(obj: bpy.types.Object, transfer: TextureTransfer, *, own_uv: 
         raise UserError(f"'{obj.name}' was changed while it was being baked; bake again.")
     if own_uv:
         check_room(data)
-    images = images or make_images(obj.name, transfer, folder, half)
-    discard(data)
+    images = images or make_images(obj.name, transfer, folder, half, owners=[data])
+    discard(data, keep_uv=not own_uv)  # it may be the one that is baked to
     uv_map = write_own_uv(data, transfer.uv) if own_uv else transfer.record.uv_map
     attach(data, images)
     data[RECORD] = replace(transfer.record, uv_map=uv_map).to_json()
@@ -159,15 +159,19 @@ def clear(obj: bpy.types.Object) -> None:
     discard(obj.data)
 
 
-def discard(data: bpy.types.Mesh) -> None:
-    """`clear` for a mesh. Without a record nothing is removed, as nothing says who made it."""
+def discard(data: bpy.types.Mesh, keep_uv: bool = False) -> None:
+    """`clear` for a mesh. Without a record nothing is removed, as nothing says who made it.
+
+    keep_uv: leave the UV map that the bake made, which stays the bake's.
+    """
     if RECORD not in data:
         return
     chosen = _chosen_attributes(data)
     for name in _own_attributes(data):
         data.attributes.remove(data.attributes[name])  # by name: removing moves the others in memory
     _choose_attributes(data, chosen)
-    remove_own_uv(data)
+    if not keep_uv:
+        remove_own_uv(data)
     detach(data)
     discard_bounces(data)
     del data[RECORD]

@@ -2,6 +2,8 @@
 """Transfer textures as Blender images: OpenEXR files, packed or beside the .blend, known to their mesh."""
 from __future__ import annotations
 
+import itertools
+import os
 import re
 import tempfile
 from collections.abc import Iterable, Sequence
@@ -22,7 +24,7 @@ RECORD = "neural_gash"         # custom property of an image: the record of the 
 
 
 def make_images(name: str, transfer: TextureTransfer, folder: Path | None, half: bool, parts: str = "",
-                label: str = "prt") -> list[bpy.types.Image]:
+                label: str = "prt", owners: Sequence[bpy.types.Mesh] = ()) -> list[bpy.types.Image]:
     """New images that hold a texture bake, four coefficients each.
 
     Args:
@@ -30,13 +32,16 @@ def make_images(name: str, transfer: TextureTransfer, folder: Path | None, half:
         half: 16 bits a channel instead of 32.
         parts: what the record does not say of each object that shares the texture, as JSON.
         label: what the files are called after the object.
+        owners: the meshes that the images are for, whose earlier files are replaced.
     Raises:
         UserError: files cannot be written there, or others' are in the way.
     """
     if folder is not None:
-        return _load(name, _write(name, transfer, folder, half, parts, label), transfer.record, half)
+        stem = _free_stem(name, folder, label, transfer.record, owners)
+        return _load(name, _write(stem, transfer, folder, half, parts), transfer.record, half)
     with tempfile.TemporaryDirectory(prefix="neural_gash-") as temporary:
-        images = _load(name, _write(name, transfer, Path(temporary), half, parts, label), transfer.record, half)
+        stem = _stem(name, label)
+        images = _load(name, _write(stem, transfer, Path(temporary), half, parts), transfer.record, half)
         for image in images:
             image.pack()
             image.filepath_raw = f"//{Path(image.filepath_raw).name}"  # the file itself is going
@@ -79,6 +84,8 @@ def bake_images(data: bpy.types.Mesh, record: BakeRecord, key: str = TRANSFER) -
             text, _, _ = exr.read_record(path)
             if text != image.get(RECORD):
                 raise UserError(f"The file '{path}' is of another bake than the object's; bake again.")
+        if not all(image.size):
+            raise UserError(f"The image '{image.name}' of the bake cannot be read ('{image.filepath}'); bake again.")
         if tuple(image.size) != (record.side, record.side):
             raise UserError(f"The image '{image.name}' has {image.size[0]} x {image.size[1]} texels, "
                             f"but the bake has {record.side} x {record.side}; bake again.")
@@ -94,11 +101,37 @@ def _attached(data: bpy.types.Mesh, key: str) -> list[bpy.types.Image | None]:
             for key in sorted(stored.keys(), key=int)]
 
 
-def _write(name: str, transfer: TextureTransfer, folder: Path, half: bool, parts: str, label: str
-           ) -> list[Path]:
-    """Write the files, each in one step, and the record beside them."""
+def _stem(name: str, label: str, number: int = 0) -> str:
+    """What the files of an object are called, but for their number and suffix."""
     clean = re.sub(r"[^\w.-]+", "_", name) or "mesh"
-    paths = [folder / f"{clean}_{label}_{number}.exr" for number in range(image_count(transfer.record.terms))]
+    return f"{clean}_{number}_{label}" if number else f"{clean}_{label}"
+
+
+def _free_stem(name: str, folder: Path, label: str, record: BakeRecord, owners: Sequence[bpy.types.Mesh]) -> str:
+    """`_stem` with the first number at which no file is replaced that holds the bake of another mesh.
+
+    Names may differ in what no file name has, an object may have had the name before, and copies share files.
+    """
+    others = [mesh for mesh in bpy.data.meshes if mesh.users and mesh not in owners]
+    taken = {_plain(bpy.path.abspath(image.filepath)) for mesh in others for key in (TRANSFER, BOUNCED)
+             for image in _attached(mesh, key) if image is not None and not image.packed_file}
+    return next(stem for number in itertools.count() if taken.isdisjoint(
+        map(_plain, _paths(folder, stem := _stem(name, label, number), record))))
+
+
+def _plain(path: Path | str) -> str:
+    """A path to compare with others; not all file systems tell capitals from small letters."""
+    return os.path.realpath(path).casefold()
+
+
+def _paths(folder: Path, stem: str, record: BakeRecord) -> list[Path]:
+    """The image files of a bake."""
+    return [folder / f"{stem}_{number}.exr" for number in range(image_count(record.terms))]
+
+
+def _write(stem: str, transfer: TextureTransfer, folder: Path, half: bool, parts: str) -> list[Path]:
+    """Write the files, each in one step, and the record beside them."""
+    paths = _paths(folder, stem, transfer.record)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -114,7 +147,7 @@ def _write(name: str, transfer: TextureTransfer, folder: Path, half: bool, parts
     try:
         for number, path in enumerate(paths):
             exr.write(path, transfer.image(number, filled).reshape(side, side, 4), text, half)
-        with atomic(folder / f"{clean}_{label}.json") as draft:
+        with atomic(folder / f"{stem}.json") as draft:
             draft.write_text((f'{text[:-1]}, "objects": {parts}}}' if parts else text) + "\n")
     except OSError as error:
         raise UserError(f"The textures cannot be written to '{folder}' ({reason(error)}).") from error

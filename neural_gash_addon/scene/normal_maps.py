@@ -15,6 +15,8 @@ from .preview import shader_node
 from .uv_maps import read_uv
 from .world import linear_pixels
 
+_STEEPEST = 1e3  # of what a normal map says: far beyond 0 to 1
+
 
 def read_normal_maps(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, surface: Surface, matrix: Array
                      ) -> list[NormalMap]:
@@ -38,6 +40,10 @@ def read_normal_maps(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, surf
             slots = np.clip(slots, 0, len(obj.material_slots) - 1)
             for slot, node in found:
                 name = node.uv_map or _rendered_uv(obj.data)
+                if name not in obj.data.uv_layers:
+                    wanted = f"reads the UV map '{name}'" if name else "needs a UV map"
+                    raise UserError(f"The normal map of the material '{obj.material_slots[slot].material.name}' "
+                                    f"{wanted}, which '{obj.name}' does not have.")
                 uv = read_uv(obj.data, name)
                 maps.append(NormalMap(_pixels(obj.material_slots[slot].material, node),
                                       float(node.inputs["Strength"].default_value),
@@ -65,9 +71,10 @@ def _pixels(material: bpy.types.Material, node: bpy.types.Node) -> NDArray[np.fl
     if image is None:
         raise UserError(f"The normal map of the material '{material.name}' has no image.")
     try:
-        return np.ascontiguousarray(linear_pixels(image)[..., :3])
+        pixels = np.nan_to_num(linear_pixels(image)[..., :3], nan=0.5)  # a half in all channels bends nothing
     except UserError as error:
         raise UserError(f"The normal map of the material '{material.name}' cannot be read: {error}") from error
+    return np.ascontiguousarray(np.clip(pixels, -_STEEPEST, _STEEPEST))
 
 
 def _rendered_uv(data: bpy.types.Mesh) -> str:

@@ -19,6 +19,7 @@ from .attributes import RECORD, discard
 from .evaluation import evaluated, revealed, shown_objects
 from .frames import Array, as_array, bake_frame, rotation_part
 from .preview import preview_off
+from .uv_maps import mark_own_uv, own_uv_name
 
 SELF, VISIBLE = "SELF", "VISIBLE"
 # Stretch and places are compared to this part of their size: far above float32 noise of a turned
@@ -127,6 +128,7 @@ def make_applied_copy(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> 
         if index < len(data.materials):  # evaluation puts the object's own materials in their place
             data.materials[index] = material
     if RECORD in obj.data:  # a new mesh takes the attributes of an earlier bake along, but not its record
+        mark_own_uv(data, own_uv_name(obj.data))
         data[RECORD] = obj.data[RECORD]
         discard(data)
     new.data = data

@@ -15,6 +15,8 @@ _MOST = 8                 # UV maps that Blender keeps on a mesh
 
 def read_uv(data: bpy.types.Mesh, name: str) -> NDArray[np.float32]:
     """(C, 2) of each face corner. Raises UserError where there is no such UV map."""
+    if data.is_editmode:  # which keeps them elsewhere
+        raise UserError(f"The mesh '{data.name}' is in Edit Mode; leave it first.")
     layer = data.uv_layers.get(name)
     if layer is None or len(layer.uv) != len(data.loops):
         raise UserError(f"The mesh '{data.name}' has no UV map named '{name}'.")
@@ -25,9 +27,14 @@ def read_uv(data: bpy.types.Mesh, name: str) -> NDArray[np.float32]:
 
 def check_room(data: bpy.types.Mesh) -> None:
     """UserError where the mesh has as many UV maps as it can, and none that a bake made."""
-    if len(data.uv_layers) >= _MOST and _OWN not in data:
+    if len(data.uv_layers) >= _MOST and own_uv_name(data) not in data.uv_layers:  # a person may have removed it
         raise UserError(f"The mesh '{data.name}' has {_MOST} UV maps, and Blender keeps no more; "
                         "remove one, or bake to one of them.")
+
+
+def own_uv_name(data: bpy.types.Mesh) -> str:
+    """Name of the UV map that a bake made, which may be gone; '' where none did."""
+    return str(data.get(_OWN, ""))
 
 
 def write_own_uv(data: bpy.types.Mesh, uv: NDArray) -> str:
@@ -42,15 +49,21 @@ def write_own_uv(data: bpy.types.Mesh, uv: NDArray) -> str:
         data.uv_layers.active = data.uv_layers[names[0]]
     if names[1]:
         data.uv_layers[names[1]].active_render = True
-    data[_OWN] = own
+    mark_own_uv(data, own)
     return own
+
+
+def mark_own_uv(data: bpy.types.Mesh, name: str) -> None:
+    """Say that a bake made the UV map of this name; '': none."""
+    if name:
+        data[_OWN] = name
 
 
 def remove_own_uv(data: bpy.types.Mesh) -> None:
     """Remove the UV map that a bake made, if there is one."""
     if _OWN not in data:
         return
-    layer = data.uv_layers.get(str(data[_OWN]))
+    layer = data.uv_layers.get(own_uv_name(data))
     if layer is not None:
         data.uv_layers.remove(layer)
     del data[_OWN]

@@ -16,6 +16,8 @@ from .evaluation import shown_objects
 
 Array = NDArray[np.float64]
 
+_BRIGHTEST = 1e24  # beyond, products with the strength leave float32, as which shaders have them
+
 
 def world_light(scene: bpy.types.Scene, order: int) -> Array:
     """Light (K, 3) from the World and the visible sun lamps of a scene, in world axes.
@@ -29,7 +31,7 @@ def world_light(scene: bpy.types.Scene, order: int) -> Array:
     total = _background(scene.world, order)
     for direction, irradiance in _suns(scene):
         total += sh_light.sun(direction, irradiance, order)
-    if not np.isfinite(total).all():
+    if not np.abs(total).max() < _BRIGHTEST:  # also where it is not a number
         raise UserError("The World or a sun lamp has a strength or colour that is infinite or not a number.")
     return total
 

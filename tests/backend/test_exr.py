@@ -73,3 +73,10 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch):
     with pytest.raises(OSError):
         exr.write(path, picture(8, 8), "")
     assert path.read_bytes() == b"before" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_record_of_any_length_is_read(tmp_path):
+    """Of thousands of objects that shadow each other, by their names."""
+    text = "x" * 200_000
+    exr.write(tmp_path / "a.exr", np.zeros((4, 4, 4), np.float32), text)
+    assert exr.read_record(tmp_path / "a.exr") == (text, 4, 4)

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a person may do to texture bakes: names that clash, UV maps that go, numbers that are none."""
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+FLOOR = ([(-2, -2, 0), (2, -2, 0), (2, 2, 0), (-2, 2, 0)], [(0, 1, 2, 3)])
+LID = ([(-1, -1, 0.5), (1, -1, 0.5), (1, 1, 0.5), (-1, 1, 0.5)], [(0, 1, 2, 3)])
+
+
+@pytest.fixture
+def texture(settings):
+    settings.target, settings.side, settings.rays = "TEXTURE", 32, 16
+    return settings
+
+
+def _bake(*objects):
+    for obj in bpy.context.view_layer.objects:
+        obj.select_set(obj in objects)
+    bpy.context.view_layer.objects.active = objects[0]
+    assert bpy.ops.neural_gash.bake() == {"FINISHED"}
+
+
+def _images(obj, key="neural_gash_images"):
+    stored = obj.data[key]
+    return [stored[number] for number in sorted(stored.keys(), key=int)]
+
+
+def _pixels(image):
+    values = np.empty((image.size[1], image.size[0], 4), np.float32)
+    image.pixels.foreach_get(values.ravel())
+    return values
+
+
+def _whole(obj):
+    from neural_gash_addon.scene.attributes import check_whole, read_record
+    check_whole(obj.data, read_record(obj))
+
+
+@pytest.mark.parametrize("names", [("a b", "a/b"), ("Kiste", "kiste")])
+def test_names_that_are_the_same_in_files_do_not_share_them(make, texture, tmp_path, names):
+    texture.texture_folder = str(tmp_path)
+    floor, lid = make(*FLOOR, name=names[0]), make(*LID, name=names[1])
+    _bake(floor, lid)
+    _whole(floor)
+    _whole(lid)
+    files = sorted(tmp_path.iterdir())
+    _bake(floor, lid)  # over the files that each has already
+    assert sorted(tmp_path.iterdir()) == files and len({f.name.casefold() for f in files}) == 8
+
+
+def test_the_files_of_renamed_copied_and_shared_bakes_are_kept(make, texture, tmp_path):
+    texture.texture_folder, texture.share = str(tmp_path), True
+    old = make(*FLOOR, name="Floor")
+    _bake(old)
+    bpy.ops.object.duplicate()
+    copy = bpy.context.object
+    old.name = "Old"
+    new, lid = make(*LID, name="Floor"), make(*LID, name="Lid")
+    lid.location.z = 3
+    _bake(new, lid)
+    _bake(new)
+    for obj in (old, copy, new, lid):
+        _whole(obj)
+
+
+def test_the_uv_map_of_an_earlier_bake_can_be_chosen(make, texture):
+    obj = make()
+    _bake(obj)
+    texture.uv_map = "PRT"
+    _bake(obj)
+    assert [u.name for u in obj.data.uv_layers] == ["PRT"]
+    _whole(obj)
+    bpy.ops.neural_gash.clear()
+    assert not obj.data.uv_layers and not bpy.data.images and not obj.data.keys()
+
+
+def test_another_uv_map_in_the_place_of_the_bakes_is_said(make, texture, refused):
+    obj = make()
+    for number in range(7):
+        obj.data.uv_layers.new(name=f"Mine {number}")
+    _bake(obj)
+    obj.data.uv_layers.remove(obj.data.uv_layers["PRT"])
+    obj.data.uv_layers.new(name="Mine too")
+    record = obj.data["neural_gash"]
+    assert "8 UV maps" in refused(bpy.ops.neural_gash.bake)
+    assert obj.data["neural_gash"] == record and len(_images(obj)) == 3
+
+
+@pytest.mark.parametrize("sizing", ["RESOLUTION", "FIT", "DENSITY"])
+def test_a_mesh_without_area_is_named_and_the_others_share_a_texture(make, texture, refused, sizing):
+    texture.sizing, texture.tolerance, texture.texels_per_metre, texture.share = sizing, 0.2, 10, True
+    flat = make([(0, 0, 0), (1, 0, 0), (2, 0, 0)], [(0, 1, 2)], name="Flat")
+    assert "area" in refused(bpy.ops.neural_gash.bake)
+    floor, lid = make(*FLOOR, name="Floor"), make(*LID, name="Lid")
+    _bake(floor, lid, flat)
+    assert "neural_gash" in floor.data and "neural_gash" in lid.data and "neural_gash" not in flat.data
+
+
+def test_bad_uvs_of_one_object_spare_the_others_and_name_it(make, texture, capfd):
+    texture.uv_map, texture.share = "Mine", True
+    floor, lid, bad = (make(*FLOOR, name=name) for name in ("Floor", "Lid", "Bad"))
+    for column, obj in enumerate((floor, lid, bad)):
+        obj.data.uv_layers.new(name="Mine")
+        for loop, (u, v) in enumerate([(0, 0), (1, 0), (1, 1), (0, 1)]):
+            obj.data.uv_layers["Mine"].uv[loop].vector = ((column + 0.1 + 0.8 * u) / 3, v)
+    bad.data.uv_layers["Mine"].uv[0].vector = (math.nan, 0)
+    _bake(floor, lid, bad)
+    assert "neural_gash" in floor.data and "neural_gash" in lid.data and "neural_gash" not in bad.data
+    assert "'Bad': The UVs" in capfd.readouterr().out
+
+
+def test_a_folder_that_cannot_be_made_is_said_before_the_bake(make, texture, refused, monkeypatch, tmp_path):
+    from neural_gash_addon.ops import bake
+    monkeypatch.setattr(bake, "run", lambda _: pytest.fail("was baked"))
+    make()
+    (tmp_path / "file").write_text("x")
+    texture.texture_folder = str(tmp_path / "file" / "maps")
+    assert "is a file" in refused(bpy.ops.neural_gash.bake)
+
+
+def _normal_map(obj, value, uv_map=""):
+    image = bpy.data.images.new("bumps", 4, 4, float_buffer=True, is_data=True)
+    image.pixels.foreach_set(np.full(64, value, np.float32))
+    material = bpy.data.materials.new("Bumpy")
+    material.use_nodes = True
+    tree = material.node_tree
+    source, bend = tree.nodes.new("ShaderNodeTexImage"), tree.nodes.new("ShaderNodeNormalMap")
+    source.image, bend.uv_map = image, uv_map
+    tree.links.new(source.outputs["Color"], bend.inputs["Color"])
+    tree.links.new(bend.outputs["Normal"], tree.nodes["Principled BSDF"].inputs["Normal"])
+    tree.links.new(source.outputs["Color"], tree.nodes["Principled BSDF"].inputs["Base Color"])
+    obj.data.materials.clear()
+    obj.data.materials.append(material)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e38])
+def test_images_and_uvs_that_are_no_numbers_give_numbers(make, texture, value):
+    texture.bounces, texture.occluders = 2, "VISIBLE"
+    make(*LID, name="Lid")
+    obj = make(*FLOOR)
+    obj.data.uv_layers.new(name="Mine")
+    _normal_map(obj, value)
+    _bake(obj)
+    obj.data.uv_layers["Mine"].uv[0].vector = (math.nan, math.inf)
+    _bake(obj)
+    assert all(np.isfinite(_pixels(image)).all() for image in _images(obj))
+
+
+def test_a_normal_map_without_its_uv_map_is_named(make, texture, refused):
+    obj = make()
+    _normal_map(obj, 0.5)
+    assert "'Bumpy' needs a UV map" in refused(bpy.ops.neural_gash.bake)
+    _normal_map(obj, 0.5, "Gone")
+    assert "'Gone', which 'Thing' does not have" in refused(bpy.ops.neural_gash.bake)
+
+
+def test_infinite_pixels_of_the_world_are_refused(make, texture, refused):
+    world = bpy.context.scene.world = bpy.data.worlds.new("World")
+    world.use_nodes = True
+    sky = world.node_tree.nodes.new("ShaderNodeTexEnvironment")
+    sky.image = bpy.data.images.new("sky", 8, 4, float_buffer=True, is_data=True)
+    sky.image.pixels.foreach_set(np.full(128, math.inf, np.float32))
+    world.node_tree.links.new(sky.outputs[0], world.node_tree.nodes["Background"].inputs[0])
+    texture.gloss, texture.light_strength = True, math.inf
+    _bake(make(*FLOOR))  # with a warning
+    assert "infinite" in refused(bpy.ops.neural_gash.light_from_world)
+    assert all(np.isfinite(_pixels(image)).all() for image in bpy.data.images if image != sky.image)
+
+
+def test_glossy_bounces_in_edit_mode_are_refused_by_that(make, texture, refused):
+    _bake(make())
+    bpy.ops.object.mode_set(mode="EDIT")
+    assert "Edit Mode" in refused(bpy.ops.neural_gash.bake_gloss)
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
+@pytest.mark.parametrize("density", [1e5, 1e12, 0.1])
+def test_densities_that_no_texture_has_are_refused(make, texture, refused, density):
+    texture.sizing, texture.texels_per_metre = "DENSITY", density
+    make(*FLOOR)
+    sentence = refused(bpy.ops.neural_gash.bake)  # Blender died of the large ones
+    assert "choose fewer texels" in sentence if density > 1 else "choose more texels" in sentence
+
+
+def test_glossy_previews_whose_images_were_deleted_get_new_ones(make, texture):
+    texture.gloss = True
+    bpy.context.scene.world = bpy.data.worlds.new("Sky")
+    _bake(make(*FLOOR))
+    for image in [i for i in bpy.data.images if "gloss" in i.name]:
+        bpy.data.images.remove(image)
+    bpy.ops.neural_gash.light_from_world()
+    texture.light_rotation = 0.5
+    lit = [i for i in bpy.data.images if "gloss" in i.name]
+    assert len(lit) == 8 and any(_pixels(i).any() for i in lit)
+
+
+def test_an_applied_copy_does_not_keep_the_uv_map_of_an_earlier_bake(make, texture):
+    obj = make()
+    _bake(obj)
+    obj.modifiers.new("Finer", "SUBSURF")
+    bpy.context.view_layer.update()
+    assert bpy.ops.neural_gash.bake_applied_copy() == {"FINISHED"}
+    assert [u.name for u in bpy.context.object.data.uv_layers] == ["PRT"]
+    bpy.ops.neural_gash.clear()
+    assert not bpy.context.object.data.uv_layers and [u.name for u in obj.data.uv_layers] == ["PRT"]
+
+
+def test_a_file_cut_short_is_said_to_be_unreadable(make, texture, refused, tmp_path):
+    texture.texture_folder = str(tmp_path)
+    _bake(make(*LID))
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    for path in tmp_path.glob("*.exr"):
+        path.write_bytes(path.read_bytes()[:-20])
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.neural_gash.preview()
+    assert "cannot be read" in refused(bpy.ops.neural_gash.preview)
+    assert bpy.ops.neural_gash.bake() == {"FINISHED"}
