@@ -100,8 +100,8 @@ def _check_density(side: float, least: int) -> None:
     """UserError unless a density gives a texture that can be baked."""
     if not least <= side <= MAX_SIDE:
         choose = "fewer" if side > MAX_SIDE else "more"
-        raise UserError(f"At this density the texture would have {side:,.0f} texels a side, and {MIN_SIDE} to {MAX_SIDE} "
-                        f"can be baked; choose {choose} texels per metre.")
+        raise UserError(f"At this density the texture would have {side:,.0f} texels a side, and {MIN_SIDE} to "
+                        f"{MAX_SIDE} can be baked; choose {choose} texels per metre.")
 
 
 def _check_side(side: int | None, texels_per_metre: float | None) -> None:
