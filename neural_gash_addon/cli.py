@@ -61,12 +61,13 @@ def _parser() -> argparse.ArgumentParser:
     bake.add_argument("--order", type=int, default=3, help="bands of spherical harmonics, 2 to 5 (3)")
     quality = bake.add_mutually_exclusive_group()
     quality.add_argument("--rays", type=int, help="rays from every point")
-    quality.add_argument("--tolerance", type=float, help="relative L2 error to reach (0.02)")
+    quality.add_argument("--tolerance", type=float, default=0.02, help="relative L2 error to reach (0.02)")
     bake.add_argument("--occluders", default="self", metavar="self|visible|COLLECTION",
                       help="what casts shadows on the object (self)")
     bake.add_argument("--bounces", type=int, default=0, help="how often light may bounce between surfaces, at most (0)")
     bake.add_argument("--texture", type=_side, metavar="SIDE",
-                      help="bake to a texture of SIDE x SIDE texels instead; 'fit': as large as the tolerance needs")
+                      help="bake to a texture of SIDE x SIDE texels instead; 'fit': as large as the tolerance "
+                           "needs (0.02 with --rays)")
     bake.add_argument("--share", action="store_true", help="one texture for all objects, with --texture")
     bake.add_argument("--uv-map", metavar="NAME", default="", help="of the mesh, for --texture; else one is made")
     bake.add_argument("--textures", metavar="FOLDER", type=Path, help="write the textures as .exr there, not into OUT")
@@ -149,8 +150,7 @@ def _bake(arguments: argparse.Namespace) -> tuple[list[dict], str]:
     settings.quality = TOLERANCE if arguments.rays is None else RAYS
     if arguments.rays is not None:
         _set(settings, "rays", arguments.rays)
-    if arguments.tolerance is not None:
-        _set(settings, "tolerance", arguments.tolerance)
+    _set(settings, "tolerance", arguments.tolerance)
     if arguments.occluders.upper() in ("SELF", "VISIBLE"):
         settings.occluders = arguments.occluders.upper()
     else:
@@ -237,7 +237,8 @@ def _relight(arguments: argparse.Namespace) -> tuple[list[dict], str]:
             lighting.take_light(scene)
         else:
             lighting.store_light(scene, _hdri_light(arguments.hdri, methods.sh.MAX_ORDER))
-        scene.neural_gash.light_rotation, scene.neural_gash.light_strength = turn
+        scene.neural_gash.light_rotation = turn[0]
+        _set(scene.neural_gash, "light_strength", turn[1])
         preview_on(obj, arguments.gloss.upper() if arguments.gloss else "")
         lighting.light_object(scene, obj)
         if arguments.png:

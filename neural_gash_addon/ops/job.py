@@ -133,6 +133,9 @@ def _texture_options(obj: bpy.types.Object, settings: NeuralGashSettings, surfac
     uv = read_uv(obj.data, settings.uv_map) if settings.uv_map else None
     folder = Path(bpy.path.abspath(settings.texture_folder)) if settings.texture_folder else None
     if folder is not None and not folder.is_absolute():
+        if not settings.texture_folder.startswith("//"):
+            raise UserError(f"'{folder}' is no whole path of a folder for the textures; begin it with // to have it "
+                            "beside the .blend file.")
         raise UserError("The folder of the textures is beside a .blend file that has not been saved yet; "
                         "save it first, or leave the folder empty.")
     if folder is not None:

@@ -94,3 +94,27 @@ def test_several_objects_share_a_texture_as_large_as_they_need(run, blend, tmp_p
     baked = {r["object"]: r for r in records if "error" not in r}
     assert set(baked) == {"Ring", "Roof"} and baked["Ring"]["side"] == baked["Roof"]["side"]
     assert len(list((tmp_path / "maps").glob("*.exr"))) == 1
+
+
+def test_a_tolerance_that_the_file_holds_does_not_count(run, blend, tmp_path):
+    out = tmp_path / "a.blend"
+    assert run("bake", blend, "--object", "Ring", "--tolerance", 0.3, "--out", out).returncode == 0
+    done = run("bake", out, "--object", "Ring", "--texture", 32, "--order", 2, "--json")
+    assert json.loads(done.stdout)["tolerance"] == pytest.approx(0.02)
+
+
+def test_sizes_folders_and_strengths_that_cannot_be_are_said(run, refused, blend, tmp_path):
+    out = tmp_path / "out.blend"
+    assert "neither a number of texels nor 'fit'" in run("bake", blend, "--texture", "big", "--out", out).stderr
+    assert "is a file" in refused("bake", blend, "--object", "Ring", "--texture", 64, "--textures", blend, "--out", out)
+    assert not list(tmp_path.iterdir())   # no tiles: it was said before the bake
+    assert run("bake", blend, "--object", "Ring", "--texture", 64, "--rays", 16, "--out", out).returncode == 0
+    assert "strength" in refused("relight", out, "--strength", 1e30, "--png", tmp_path / "a.png")
+
+
+def test_tiles_of_names_that_differ_only_in_signs_are_kept_apart(tmp_path):
+    from types import SimpleNamespace
+
+    from neural_gash_addon.cli import _tiles
+    arguments = SimpleNamespace(textures=None, out=tmp_path / "a.blend", npz=None, png=None, texture=64)
+    assert len({_tiles(arguments, SimpleNamespace(name=name)) for name in ("a b", "a_b", "a/b")}) == 3

@@ -222,3 +222,10 @@ def test_a_file_cut_short_is_said_to_be_unreadable(make, texture, refused, tmp_p
     bpy.ops.neural_gash.preview()
     assert "cannot be read" in refused(bpy.ops.neural_gash.preview)
     assert bpy.ops.neural_gash.bake() == {"FINISHED"}
+
+
+def test_a_folder_without_a_beginning_is_refused(make, texture, refused, tmp_path):
+    make(*FLOOR)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    texture.texture_folder = "maps"
+    assert "begin it with //" in refused(bpy.ops.neural_gash.bake)
