@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from neural_gash_addon.backend.geometry import TriangleMesh
-from neural_gash_addon.backend.graph import graph, nearest
+from neural_gash_addon.backend.graph import graph
+from neural_gash_addon.backend.nearest import nearest
 from neural_gash_addon.backend.neighbours import Neighbours, neighbours
 
 from . import shapes

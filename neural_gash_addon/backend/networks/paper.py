@@ -61,6 +61,7 @@ class CoefficientsNet(nn.Module):
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(blocks))
         self.dropout = nn.Dropout(dropout)
         self.leave = nn.Linear(width, COEFFICIENTS)
+        nn.init.zeros_(self.leave.weight)  # training begins at "no shadows", not far from it
 
     def forward(self, x: Tensor, source: Tensor, start: Tensor) -> Tensor:
         """(N, inputs) to (N, 9)."""
