@@ -17,8 +17,8 @@ from ..backend.geometry import TEXEL
 from ..backend.record import BakeRecord
 from .attributes import attribute_count, check_whole, has_bake, read_record
 from .frames import as_array, bake_frame
-from .gloss import can_gloss, gloss_group, light_gloss
-from .gloss_nodes import SPECULAR, gloss_image_count, gloss_images, is_gloss
+from .gloss import can_gloss, gloss_group, gloss_whole, light_gloss
+from .gloss_nodes import SPECULAR, is_gloss
 from .images import bake_images, remove_unused
 from .nodes import DEFAULT_ALBEDO, ensure_group, group_terms, is_group, set_light
 
@@ -127,9 +127,8 @@ def update_light(obj: bpy.types.Object, light: NDArray) -> None:
     if any(not is_gloss(node.node_tree) and group_terms(node.node_tree) != (record.order, record.colours)
            for node in _group_nodes(obj)):
         preview_on(obj)  # baked again at another order
-    if any(is_gloss(node.node_tree) and len(gloss_images(node.node_tree)) != gloss_image_count(record.order)
-           for node in _group_nodes(obj)):
-        preview_on(obj, True)  # somebody deleted its images
+    if any(is_gloss(node.node_tree) and not gloss_whole(node, record) for node in _group_nodes(obj)):
+        preview_on(obj, True)  # somebody deleted or resized its images
     for slot in obj.material_slots:
         if _state(slot.material) is not None and slot.material.users > 1:
             slot.material = slot.material.copy()  # a duplicated object, which may be turned differently
