@@ -34,6 +34,13 @@ def gloss_group(data: bpy.types.Mesh, record: BakeRecord, lobe: str) -> bpy.type
     return build_gloss_group(record.order, images, record.uv_map, lobe)
 
 
+def gloss_whole(node: bpy.types.Node, record: BakeRecord) -> bool:
+    """Whether the group of a node is still as `gloss_group` made it for a bake, so far as `light_gloss` needs it."""
+    images = gloss_images(node.node_tree)
+    return (len(images) == gloss_image_count(record.order) and "Turn X" in node.inputs
+            and all(tuple(image.size) == (record.side, record.side) for image in images))
+
+
 def light_gloss(data: bpy.types.Mesh, record: BakeRecord, node: bpy.types.Node, light: NDArray, turn: NDArray) -> None:
     """Fill the images for a light, and tell the shader how the object is turned.
 

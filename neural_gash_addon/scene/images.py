@@ -98,7 +98,7 @@ def _attached(data: bpy.types.Mesh, key: str) -> list[bpy.types.Image | None]:
     if not hasattr(stored, "keys"):
         return []
     return [image if isinstance(image := stored[key], bpy.types.Image) else None
-            for key in sorted(stored.keys(), key=int)]
+            for key in sorted(filter(str.isdecimal, stored.keys()), key=int)]
 
 
 def _stem(name: str, label: str, number: int = 0) -> str:

@@ -29,8 +29,8 @@ def ensure_group(order: int, colours: int = 1, images: Sequence[bpy.types.Image]
     """
     place = [image.session_uid for image in images]
     for group in bpy.data.node_groups:
-        if (group.get(_ORDER) == order and group.get(_VERSION) == GROUP_VERSION and group.library is None
-                and group.get(_COLOURS) == colours and _place(group) == (place, uv_map)):
+        if (is_group(group) and group.get(_VERSION) == GROUP_VERSION and group.library is None
+                and group_terms(group) == (order, colours) and _place(group) == (place, uv_map)):
             return group
     group = bpy.data.node_groups.new(f"PRT Shading {order}", "ShaderNodeTree")
     _build(group, order, colours,
@@ -50,7 +50,9 @@ def is_group(group: bpy.types.NodeTree | None) -> bool:
 
 
 def group_terms(group: bpy.types.NodeTree) -> tuple[int, int]:
-    """Order and colours of one of `ensure_group`'s groups."""
+    """Order and colours of one of `ensure_group`'s groups; zeros where somebody removed its inputs."""
+    if f"L{int(group[_ORDER]) ** 2 - 1}" not in group.interface.items_tree:
+        return 0, 0
     return int(group[_ORDER]), int(group.get(_COLOURS, 1))
 
 

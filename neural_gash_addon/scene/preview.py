@@ -17,8 +17,8 @@ from ..backend.geometry import TEXEL
 from ..backend.record import BakeRecord
 from .attributes import attribute_count, check_whole, has_bake, read_record
 from .frames import as_array, bake_frame
-from .gloss import can_gloss, gloss_group, light_gloss
-from .gloss_nodes import SPECULAR, gloss_image_count, gloss_images, is_gloss, lobe_of
+from .gloss import can_gloss, gloss_group, gloss_whole, light_gloss
+from .gloss_nodes import SPECULAR, is_gloss, lobe_of
 from .images import bake_images, remove_unused
 from .nodes import DEFAULT_ALBEDO, ensure_group, group_terms, is_group, set_light
 
@@ -128,8 +128,8 @@ def update_light(obj: bpy.types.Object, light: NDArray) -> None:
            for node in _group_nodes(obj)):
         preview_on(obj)  # baked again at another order
     for node in _group_nodes(obj):
-        if is_gloss(node.node_tree) and len(gloss_images(node.node_tree)) != gloss_image_count(record.order):
-            preview_on(obj, lobe_of(node.node_tree))  # somebody deleted its images
+        if is_gloss(node.node_tree) and not gloss_whole(node, record):
+            preview_on(obj, lobe_of(node.node_tree))  # somebody deleted or resized its images
             break
     for slot in obj.material_slots:
         if _state(slot.material) is not None and slot.material.users > 1:

@@ -189,16 +189,41 @@ def test_densities_that_no_texture_has_are_refused(make, texture, refused, densi
     assert "choose fewer texels" in sentence if density > 1 else "choose more texels" in sentence
 
 
-def test_glossy_previews_whose_images_were_deleted_get_new_ones(make, texture):
+@pytest.mark.parametrize("damage", ["deleted", "resized", "sockets"])
+def test_glossy_previews_that_were_damaged_are_made_anew(make, texture, damage):
     texture.gloss = True
     bpy.context.scene.world = bpy.data.worlds.new("Sky")
     _bake(make(*FLOOR))
     for image in [i for i in bpy.data.images if "gloss" in i.name]:
-        bpy.data.images.remove(image)
+        if damage == "deleted":
+            bpy.data.images.remove(image)
+        elif damage == "resized":
+            image.scale(8, 8)
+    if damage == "sockets":
+        bpy.data.node_groups[0].interface.clear()
     bpy.ops.neural_gash.light_from_world()
-    texture.light_rotation = 0.5
     lit = [i for i in bpy.data.images if "gloss" in i.name]
-    assert len(lit) == 8 and any(_pixels(i).any() for i in lit)
+    assert len(lit) == 8 and any(_pixels(i).any() for i in lit) and len(bpy.data.node_groups) == 1
+
+
+@pytest.mark.parametrize("target", ["TEXTURE", "VERTICES"])
+def test_previews_whose_group_lost_its_inputs_are_made_anew(make, texture, target):
+    texture.target = target
+    _bake(make(*FLOOR))
+    bpy.data.node_groups[0].interface.clear()
+    texture.light_rotation = 0.5
+    bpy.ops.neural_gash.light_from_world()
+    assert len(bpy.data.node_groups) == 1 and "L8" in bpy.data.node_groups[0].interface.items_tree
+
+
+def test_damaged_lists_of_images_are_a_bake_that_lost_some(make, texture, refused):
+    obj = make()
+    _bake(obj)
+    obj.data["neural_gash_images"] = {"x": 1, "0": 2}
+    bpy.ops.neural_gash.preview()
+    assert "lost some of its images" in refused(bpy.ops.neural_gash.preview)
+    _bake(obj)
+    _whole(obj)
 
 
 def test_an_applied_copy_does_not_keep_the_uv_map_of_an_earlier_bake(make, texture):

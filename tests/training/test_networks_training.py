@@ -59,7 +59,7 @@ def test_gnn_learns_and_goes_on_from_its_checkpoint(cache, tmp_path, monkeypatch
 def test_gnn_examples_have_the_labels_of_their_frames(cache, parts):
     """Local coefficients of fully blocked points would be the lobe about e_y; energy and share do not turn."""
     sample = samples(cache)[0]
-    seen, truth = gnn.example(sample, 500, np.random.default_rng(0), parts)
+    seen, truth = gnn.example(sample, 10_000, np.random.default_rng(0), parts)
     assert seen.shape[2] == len(truth) and torch.isfinite(seen).all()
     blocked = sh.cosine_lobe(sample.normals, labels.ORDER) - sample.coefficients
     if not parts:
