@@ -14,6 +14,15 @@ from neural_gash_addon.backend.exchange import write_npz  # noqa: E402
 from training import curves, gnn, labels, paper  # noqa: E402
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """As the trainings run: on a busy machine a second thread of torch waits for a core, and everything for it."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory):
     """Two labelled meshes."""
@@ -33,9 +42,9 @@ def samples(cache):
 def test_gnn_learns_and_goes_on_from_its_checkpoint(cache, tmp_path, monkeypatch):
     monkeypatch.setattr(gnn, "POINTS", 200)
     monkeypatch.setattr(gnn, "WARM_UP", 5)
-    monkeypatch.setattr(gnn, "EVERY", 20)
+    monkeypatch.setattr(gnn, "EVERY", 8)
     known = samples(cache)
-    whole = gnn.train(known, known, 40, 3, tmp_path / "one", tmp_path / "one.csv")
+    whole = gnn.train(known, known, 16, 3, tmp_path / "one", tmp_path / "one.csv")
     with (tmp_path / "one.csv").open(newline="") as file:
         losses = [float(row["loss"]) for row in csv.DictReader(file)]
     assert len(losses) == 2 and losses[1] < losses[0]
@@ -49,8 +58,8 @@ def test_gnn_learns_and_goes_on_from_its_checkpoint(cache, tmp_path, monkeypatch
     with monkeypatch.context() as patch:
         patch.setattr(gnn.Trainer, "save", lambda self, save=gnn.Trainer.save: (save(self), stop()))
         with pytest.raises(Stopped):
-            gnn.train(known, known, 40, 3, tmp_path / "two", tmp_path / "two.csv")
-    again = gnn.train(known, known, 40, 3, tmp_path / "two", tmp_path / "two.csv")
+            gnn.train(known, known, 16, 3, tmp_path / "two", tmp_path / "two.csv")
+    again = gnn.train(known, known, 16, 3, tmp_path / "two", tmp_path / "two.csv")
     for one, two in zip(whole.parameters(), again.parameters(), strict=True):
         np.testing.assert_allclose(two.detach(), one.detach(), atol=1e-6)
 
