@@ -23,6 +23,7 @@ from neural_gash_addon.backend.workers import default_threads
 
 ORDER, REFERENCE_RAYS, REPEATS = 3, 2048, 3
 RAYS = (4, 8, 16, 32)  # of Embree, beside
+ENOUGH = 1.0           # seconds of a bake that is not repeated
 MOST_SRR, MOST_OVER, MOST_COST = 0.35, 1.05, 15.0  # asked for: over all, on the worst mesh, µs a vertex
 
 NETWORKS = [name for name, method in methods.METHODS.items() if name != "analytic" and not method.traces]
@@ -40,6 +41,8 @@ def measure(mesh: TriangleMesh, unshadowed: np.ndarray, reference: np.ndarray
     errors, spent, residuals = {}, {label(*column): [] for column in COLUMNS}, {}
     for repeat in range(REPEATS):
         for method, rays in COLUMNS:
+            if max(spent[label(method, rays)], default=0.0) > ENOUGH:
+                continue
             kept: list[np.ndarray] = []
             baking = methods.bake(mesh, method, ORDER, rays=rays, seed=repeat)
             spent[label(method, rays)].append(
@@ -55,7 +58,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--folder", type=Path, default=FOLDER / "validation")
     parser.add_argument("--only", help="files whose name has this in it")
+    parser.add_argument("--network", choices=NETWORKS, help="one of them alone")
     arguments = parser.parse_args()
+    if arguments.network:
+        NETWORKS[:] = [arguments.network]
+        COLUMNS[:] = [column for column in COLUMNS if column[0] in ("embree", arguments.network)]
     categories = {}
     if (FOLDER / "MANIFEST.csv").is_file():
         with (FOLDER / "MANIFEST.csv").open(newline="") as file:
