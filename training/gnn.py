@@ -7,31 +7,26 @@ code that makes it in the add-on. Every step takes some points of one mesh, turn
 from __future__ import annotations
 
 import argparse
-import copy
-import csv
-import time
 from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
-from tqdm import trange
 
 from neural_gash_addon.backend import cones, gnn, weights
 from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.conformal import DIRECTION_COUNT
 
-from . import data, labels
+from . import data, labels, loop
 from .curves import draw
 
 CONE = (48, 16)                # units of stage 1
 POINT = (160, 96)              # of stage 2
-STEPS, RATE, WARM_UP = 12_000, 2e-3, 300
+STEPS, RATE = 12_000, 2e-3
 POINTS = 3000                  # of a step
 MOST_POINTS = 60_000           # of a mesh in memory
 FLOOR = 3e-4                   # of the unshadowed energy: the labels' own noise, and what no eye sees
-AVERAGED = 0.999               # of the running mean of the weights, which is what ships
 PARTS = 0.3                    # of the steps see a part of the mesh as what is baked, and the rest as its occluders
 HELD_OUT = 0.1
 EVERY = 1000                   # steps, the held-out meshes are looked at and all is saved
@@ -59,7 +54,7 @@ class Net(nn.Module):
 
     def network(self) -> dict[str, np.ndarray]:
         """The same for NumPy."""
-        return {name: value.detach().numpy().copy() for name, value in self.state_dict().items()}
+        return {name: value.detach().cpu().numpy().copy() for name, value in self.state_dict().items()}
 
 
 def example(sample: labels.Sample, count: int, rng: np.random.Generator, parts: float = PARTS
@@ -95,85 +90,35 @@ def near(positions: np.ndarray, triangles: np.ndarray, rng: np.random.Generator)
     return inside if inside.sum() >= 100 else np.ones_like(inside)
 
 
-def evaluate(model: Net, held: list[labels.Sample], terms: int = 9) -> list[float]:
+def evaluate(model: nn.Module, held: list[labels.Sample], terms: int = 9) -> list[float]:
     """SRR of each held-out mesh, always of the same points."""
     rng = np.random.default_rng(5)
     out = []
     with torch.no_grad():
         for sample in held:
-            seen, truth = example(sample, 1500, rng, parts=0)
+            seen, truth = (tensor.to(loop.device()) for tensor in example(sample, 1500, rng, parts=0))
             error = (model(seen) - truth)[:, :terms].square().sum()
             out.append(float(error / truth[:, :terms].square().sum().clamp_min(1e-9)))
     return out
 
 
-class Trainer:
-    """The state of a training, which is saved as it goes on."""
-
-    def __init__(self, steps: int, seed: int, checkpoint: Path) -> None:
-        torch.manual_seed(seed)
-        self.model = Net()
-        self.mean = copy.deepcopy(self.model)
-        self.optimiser = torch.optim.AdamW(self.model.parameters(), RATE, weight_decay=1e-3)
-        self.steps, self.step, self.seconds, self.seed, self.checkpoint = steps, 0, 0.0, seed, checkpoint
-        self.rows: list[list[float]] = []
-        if checkpoint.exists():
-            kept = torch.load(checkpoint, weights_only=True)
-            if (kept["steps"], kept["seed"]) == (steps, seed):
-                self.model.load_state_dict(kept["model"])
-                self.mean.load_state_dict(kept["mean"])
-                self.optimiser.load_state_dict(kept["optimiser"])
-                self.step, self.seconds, self.rows = kept["step"], kept["seconds"], kept["rows"]
-
-    def save(self) -> None:
-        """Write the checkpoint, whole or not at all."""
-        draft = self.checkpoint.with_suffix(".draft")
-        torch.save({"steps": self.steps, "seed": self.seed, "model": self.model.state_dict(),
-                    "mean": self.mean.state_dict(), "optimiser": self.optimiser.state_dict(), "step": self.step,
-                    "seconds": self.seconds, "rows": self.rows}, draft)
-        draft.replace(self.checkpoint)
-
-    def rate(self) -> float:
-        """Of this step: a short rise, then half a cosine."""
-        return RATE * min(1.0, (self.step + 1) / WARM_UP) * 0.5 * (1 + float(np.cos(np.pi * self.step / self.steps)))
-
-    def take(self, seen: Tensor, truth: Tensor) -> float:
-        """One step; its loss."""
-        for group in self.optimiser.param_groups:
-            group["lr"] = self.rate()
-        floor = FLOOR * len(truth)
-        loss = (((self.model(seen) - truth).square().sum() + floor) / (truth.square().sum() + floor)).log()
-        self.optimiser.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
-        self.optimiser.step()
-        with torch.no_grad():
-            for kept, now in zip(self.mean.parameters(), self.model.parameters(), strict=True):
-                kept.lerp_(now, 1 - min(AVERAGED, (self.step + 1) / (self.step + 10)))
-        self.step += 1
-        return loss.item()
-
-
 def train(kept: list[labels.Sample], held: list[labels.Sample], steps: int, seed: int, checkpoint: Path, log: Path
           ) -> Net:
     """Train, and write log and checkpoint as we go; on from the checkpoint, where there is one of just this."""
-    trainer = Trainer(steps, seed, checkpoint)
-    began = time.time() - trainer.seconds
-    losses: list[float] = []
-    for step in trange(trainer.step, steps, initial=trainer.step, total=steps, desc="training"):
-        rng = np.random.default_rng([seed, step])
-        losses.append(trainer.take(*example(kept[rng.integers(len(kept))], POINTS, rng)))
-        if trainer.step % EVERY == 0 or trainer.step == steps:
-            found = evaluate(trainer.mean, held)
-            trainer.seconds = time.time() - began
-            trainer.rows.append([trainer.step, round(trainer.seconds), round(float(np.mean(losses)), 4),
-                                 *(round(float(f(found)), 5) for f in (np.median, np.mean, np.max))])
-            losses = []
-            trainer.save()
-            with log.open("w", newline="") as file:
-                csv.writer(file).writerows([["step", "seconds", "loss", "srr_median", "srr_mean", "srr_worst"],
-                                            *trainer.rows])
-    return trainer.mean
+    torch.manual_seed(seed)
+    model = Net().to(loop.device())
+
+    def loss_of(model: nn.Module, rng: np.random.Generator) -> Tensor:
+        seen, truth = (tensor.to(loop.device()) for tensor in example(kept[rng.integers(len(kept))], POINTS, rng))
+        floor = FLOOR * len(truth)
+        return (((model(seen).float() - truth).square().sum() + floor) / (truth.square().sum() + floor)).log()
+
+    def look(model: nn.Module) -> dict[str, float]:
+        found = evaluate(model, held)
+        return {"srr_mean": float(np.mean(found)), "srr_median": float(np.median(found)), "srr_worst": max(found)}
+
+    return loop.run(model, loss_of, look, steps=steps, rate=RATE, every=EVERY, seed=seed, checkpoint=checkpoint,
+                    log=log)
 
 
 def main() -> None:

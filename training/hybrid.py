@@ -7,19 +7,17 @@ flow through all passes.
 from __future__ import annotations
 
 import argparse
-import csv
-import time
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from tqdm import trange
 
 from neural_gash_addon.backend import hybrid, weights
 from neural_gash_addon.backend import spherical_harmonics as sh
 
-from . import hybrid_data
+from . import hybrid_data, loop
+from .curves import draw
 
 PASSES, HIDDEN = 2, 16
 PATCH = 6000          # points of a training example: neighbouring ones of one mesh
@@ -105,7 +103,7 @@ def srr(found: Tensor, truth: Tensor) -> Tensor:
     return (found - truth).square().sum() / truth.square().sum().clamp_min(1e-12)
 
 
-def evaluate(model: Filter, examples: list[Example], order: int = 3) -> dict[int, tuple[float, float]]:
+def evaluate(model: nn.Module, examples: list[Example], order: int = 3) -> dict[int, tuple[float, float]]:
     """Median SRR before and after, by rays."""
     out = {}
     terms = order * order
@@ -121,39 +119,27 @@ def evaluate(model: Filter, examples: list[Example], order: int = 3) -> dict[int
     return out
 
 
-def train(examples: list[Example], held: list[Example], steps: int, log: Path, passes: int = PASSES,
+def train(kept: list[Example], held: list[Example], steps: int, checkpoint: Path, log: Path, passes: int = PASSES,
           hidden: int = HIDDEN, seed: int = 0) -> Filter:
-    """Train, and write the log as we go."""
+    """Train, and write log and checkpoint as we go; on from the checkpoint, where there is one of just this."""
     torch.manual_seed(seed)
-    rng = np.random.default_rng(seed)
-    model = Filter(passes, hidden)
-    optimiser = torch.optim.AdamW(model.parameters(), RATE, weight_decay=1e-4)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=steps, pct_start=0.1)
-    began = time.time()
-    with log.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["step", "seconds", "loss", *(f"srr_{r}" for r in hybrid_data.RAYS)])
-        losses: list[float] = []
-        for step in trange(steps, desc="training"):
-            example = examples[rng.integers(len(examples))]
-            given, truth = example.batch(int(rng.choice(hybrid_data.RAYS)), rng)
-            if float(truth.square().sum()) < 1e-6 * len(truth):
-                continue  # nothing to learn where nothing is blocked
-            found = model(*given)
-            loss = (srr(found[-1], truth) + FLOOR).log() + 0.1 * (srr(found[0], truth) + FLOOR).log()
-            optimiser.zero_grad()
-            loss.backward()
-            nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-            optimiser.step()
-            schedule.step()
-            losses.append(float(loss))
-            if (step + 1) % 500 == 0 or step + 1 == steps:
-                srrs = evaluate(model, held)
-                writer.writerow([step + 1, round(time.time() - began), round(float(np.mean(losses)), 4),
-                                 *(round(after, 5) for _, after in srrs.values())])
-                file.flush()
-                losses = []
-    return model
+
+    def loss_of(model: nn.Module, rng: np.random.Generator) -> Tensor:
+        while True:
+            given, truth = kept[rng.integers(len(kept))].batch(int(rng.choice(hybrid_data.RAYS)), rng)
+            if float(truth.square().sum()) >= 1e-6 * len(truth):  # nothing to learn where nothing is blocked
+                break
+        found = model(*given)
+        return (srr(found[-1], truth) + FLOOR).log() + 0.1 * (srr(found[0], truth) + FLOOR).log()
+
+    def look(model: nn.Module) -> dict[str, float]:
+        found = {rays: after for rays, (_, after) in evaluate(model, held).items()}
+        mean = float(np.exp(np.mean(np.log(list(found.values())))))
+        return {"srr": mean, **{f"srr_{rays}": after for rays, after in found.items()}}
+
+    # patches are small and of irregular shape: a GPU would wait for them
+    return loop.run(Filter(passes, hidden), loss_of, look, steps=steps, rate=RATE, every=500, seed=seed,
+                    checkpoint=checkpoint, log=log)
 
 
 def main() -> None:
@@ -170,8 +156,9 @@ def main() -> None:
     held = examples[::HELD_OUT]
     kept = [e for e in examples if e not in held]
     log = Path(__file__).parent / "logs" / "hybrid.csv"
-    log.parent.mkdir(exist_ok=True)
-    model = train(kept, held, arguments.steps, log, arguments.passes, arguments.hidden)
+    model = train(kept, held, arguments.steps, hybrid_data.CACHE / "hybrid.checkpoint", log, arguments.passes,
+                  arguments.hidden)
+    draw(log, [f"srr_{rays}" for rays in (2, 4, 8, 16, 32)])
     arguments.out.mkdir(parents=True, exist_ok=True)
     weights.save_hybrid(arguments.out / weights.HYBRID, model.network())
     for rays, (before, after) in evaluate(model, held).items():

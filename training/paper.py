@@ -1,24 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Train the paper's networks from nothing: `make data`, then `python -m training.paper --network gnn-paper`.
 
-Each step takes a patch of one mesh, turned at random; visibility is traced anew, because the directions turn with
-the normals. `--encoding` and `--seed` are for the ablation of the encoding, whose logs are in logs/.
+Each step takes a patch of one mesh, turned and scaled at random; visibility is traced anew, because the directions turn
+with the normals.
 """
 from __future__ import annotations
 
 import argparse
-import csv
-import time
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 from torch.nn import functional
-from tqdm import trange
 
 from neural_gash_addon.backend import conformal, paper_bake, weights
 from neural_gash_addon.backend import spherical_harmonics as sh
@@ -27,7 +25,7 @@ from neural_gash_addon.backend.neighbours import Neighbours
 from neural_gash_addon.backend.networks import paper
 from neural_gash_addon.backend.raycast import Occluders
 
-from . import data, labels
+from . import data, labels, loop
 from .curves import draw
 
 ENCODINGS: dict[str, tuple[int, Callable[[np.ndarray, np.ndarray], np.ndarray]]] = {
@@ -38,8 +36,12 @@ ENCODINGS: dict[str, tuple[int, Callable[[np.ndarray, np.ndarray], np.ndarray]]]
 }
 NETWORKS: dict[str, Callable[[int], nn.Module]] = {
     "mlp": paper.Mlp, "gnn-paper": paper.TwoStage, "end-to-end": paper.CoefficientsNet, "student": paper.Mlp}
-STEPS = {"mlp": 6000, "student": 6000, "gnn-paper": 2500, "end-to-end": 2500}
-RATE, PATCH, MOST_POINTS, EVERY, HELD_OUT = 2e-3, 1500, 30_000, 250, 0.1
+Model = TypeVar("Model", bound=nn.Module)
+STEPS = {"mlp": 3000, "student": 3000, "gnn-paper": 4000, "end-to-end": 2000}
+RATE, PATCH, HELD_OUT, LOOKS = 2e-3, 1500, 0.1, 20
+INNER = 0.6            # of a patch's points count: around the others there is too little of the mesh
+SCALES = (0.8, 1.25)
+MOST_POINTS, BYTES_A_POINT = 30_000, 100  # of a mesh, and what its file takes
 FLOOR = 3e-4  # of the unshadowed energy, as in training.gnn
 
 
@@ -51,10 +53,12 @@ class Example(NamedTuple):
     start: Tensor       # (n + 1,)
     blocked: Tensor     # (n, 9) in world axes
     visibility: Tensor  # (n, 25)
+    inner: Tensor       # (n,) whose neighbours' neighbours are in the patch, too: those count
+    free: float         # share of the mesh's rays that are free
 
 
 class Source:
-    """A labelled mesh with its graph."""
+    """A labelled mesh with its graph, and what traces it."""
 
     def __init__(self, path: Path) -> None:
         self.sample = labels.load(path)
@@ -64,28 +68,39 @@ class Source:
         start = np.searchsorted(point[order], np.arange(len(self.sample.positions) + 1))
         self.graph = graph(self.sample.positions.astype(np.float64), Neighbours(start, other[order].astype(np.int32)))
         self.blocked = (self.sample.unshadowed - self.sample.coefficients)[:, :paper.COEFFICIENTS]
+        self.free = float(self.sample.visibility.mean())
+
+    @cached_property
+    def scene(self) -> Occluders:
+        """Made when the first patch is turned."""
+        return Occluders([(self.sample.positions, self.sample.triangles)])
 
     def example(self, encoding: str, rng: np.random.Generator | None, traced: bool = True) -> Example:
-        """A patch, turned, with its visibility where it is `traced`; all of the mesh as it is without a generator."""
+        """A patch, turned and scaled, with its visibility where it is `traced`; the whole mesh without a generator."""
         sample = self.sample
-        turn = np.eye(3) if rng is None else Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
-        positions, normals = (a.astype(np.float64) @ turn.T for a in (sample.positions, sample.normals))
-        rows = np.arange(len(positions))
-        if rng is not None and len(rows) > PATCH:
-            away = np.square(positions - positions[rng.integers(len(rows))]).sum(1)
-            rows = np.sort(np.argpartition(away, PATCH)[:PATCH])
+        turn, scale = np.eye(3), 1.0
+        rows, inner = np.arange(len(sample.positions)), np.ones(len(sample.positions), bool)
+        if rng is not None:
+            turn, scale = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix(), rng.uniform(*SCALES)
+            if len(rows) > PATCH:
+                away = np.square(sample.positions - sample.positions[rng.integers(len(rows))]).sum(1)
+                rows = np.sort(np.argpartition(away, PATCH)[:PATCH])
+                inner = away[rows] <= np.quantile(away[rows], INNER)
+        positions, normals = (a.astype(np.float64) @ turn.T for a in (sample.positions, sample.normals[rows]))
         blocked = sh.rotate_each(self.blocked[rows], np.broadcast_to(turn, (len(rows), 3, 3)))
         seen = sample.visibility[rows]
         if rng is not None and traced:
-            scene = Occluders([(positions, sample.triangles)])
-            directions = np.einsum("nij,dj->ndi", labels.motor_frames(normals[rows]), sample.directions)
-            origins = np.repeat(scene.origins(positions[rows], normals[rows]), seen.shape[1], axis=0)
-            seen = scene.blocked(origins, np.ascontiguousarray(directions.reshape(-1, 3), np.float32)) != 0
-        encoded = ENCODINGS[encoding][1](paper_bake.placed(positions)[rows], normals[rows])
+            # in the mesh as it lies, along the directions that the turned normals have, turned back
+            frames = turn.T @ labels.motor_frames(normals)
+            directions = np.einsum("nij,dj->ndi", frames, sample.directions)
+            places = self.scene.origins(sample.positions[rows], sample.normals[rows])
+            seen = self.scene.blocked(np.repeat(places, seen.shape[1], axis=0),
+                                      np.ascontiguousarray(directions.reshape(-1, 3), np.float32)) != 0
+        encoded = ENCODINGS[encoding][1](scale * paper_bake.placed(positions)[rows], normals)
         edges = within(self.graph, rows)
-        return Example(*(torch.from_numpy(np.ascontiguousarray(a)) for a in (
+        return Example(*(torch.from_numpy(np.ascontiguousarray(a)).to(loop.device()) for a in (
             encoded.astype(np.float32), edges.source, edges.start, blocked.astype(np.float32),
-            seen.reshape(len(rows), -1).astype(np.float32))))
+            seen.reshape(len(rows), -1).astype(np.float32), inner)), self.free)
 
 
 def within(edges: Graph, rows: np.ndarray) -> Graph:
@@ -98,108 +113,111 @@ def within(edges: Graph, rows: np.ndarray) -> Graph:
     return Graph(np.searchsorted(target[kept], np.arange(len(rows) + 1)), source[kept])
 
 
-def balanced(logits: Tensor, truth: Tensor) -> Tensor:
-    """Binary cross-entropy in which blocked and free rays weigh alike, however few there are (section 4.2.1)."""
-    share = truth.mean().clamp(0.01, 0.99)
+def balanced(logits: Tensor, truth: Tensor, free: float) -> Tensor:
+    """Binary cross-entropy in which a mesh's blocked and free rays weigh alike (section 4.2.1); free: their share."""
+    share = min(max(free, 0.02), 0.98)
     weight = torch.where(truth > 0.5, 0.5 / share, 0.5 / (1 - share))
-    return functional.binary_cross_entropy_with_logits(logits, truth, weight)
+    return functional.binary_cross_entropy_with_logits(logits.float(), truth, weight)
 
 
 def shadow_loss(found: Tensor, truth: Tensor) -> Tensor:
     """Logarithm of the shadow residual ratio: a mesh with few shadows counts as one with many."""
     floor = FLOOR * len(truth)
-    return (((found - truth).square().sum() + floor) / (truth.square().sum() + floor)).log()
+    return (((found.float() - truth).square().sum() + floor) / (truth.square().sum() + floor)).log()
 
 
-def loss_of(network: str, model: nn.Module, example: Example, teacher: nn.Module | None) -> Tensor:
-    """What is minimised: coefficients, and for two stages visibility; a student follows its teacher (4.1.1)."""
+def loss_of(model: nn.Module, example: Example, teacher: nn.Module | None = None) -> Tensor:
+    """What is minimised of coefficients; a student follows its teacher, too (section 4.1.1)."""
     found = model(example.encoded, example.source, example.start)
-    if network == "gnn-paper":
-        coefficients, logits = found
-        return shadow_loss(coefficients, example.blocked) + balanced(logits, example.visibility)
+    found = (found[0] if isinstance(found, tuple) else found)[example.inner]
+    loss = shadow_loss(found, example.blocked[example.inner])
     if teacher is None:
-        return shadow_loss(found, example.blocked)
+        return loss
     with torch.no_grad():
         target, _ = teacher(example.encoded, example.source, example.start)
-    return shadow_loss(found, example.blocked) + shadow_loss(found, target)
+    return loss + shadow_loss(found, target[example.inner])
 
 
-class Score(NamedTuple):
-    """How a network does on meshes it was not trained on."""
-
-    srr_median: float
-    srr_mean: float
-    accuracy: float  # balanced, of visibility; NaN where there is none
-
-
-def evaluate(model: nn.Module, held: list[Source], encoding: str) -> Score:
-    """On whole meshes."""
-    model.eval()
+def evaluate(model: nn.Module, held: list[Source], encoding: str) -> dict[str, float]:
+    """On whole meshes that it was not trained on: SRR, and the balanced accuracy of visibility where it gives one."""
     ratios, accuracies = [], []
     with torch.no_grad():
         for source in held:
             example = source.example(encoding, None)
             found = model(example.encoded, example.source, example.start)
             if isinstance(found, tuple):
-                right = (found[1] > 0) == (example.visibility > 0.5)
-                free = example.visibility > 0.5
-                accuracies.append(float(right[free].float().mean() + right[~free].float().mean()) / 2)
+                accuracies.append(accuracy(found[1] > 0, example.visibility > 0.5))
                 found = found[0]
             energy = example.blocked.square().sum().clamp_min(1e-9)
             ratios.append(float((found - example.blocked).square().sum() / energy))
-    model.train()
-    return Score(float(np.median(ratios)), float(np.mean(ratios)),
-                 float(np.nanmean(accuracies)) if accuracies else float("nan"))
+    out = {"srr_median": float(np.median(ratios)), "srr_mean": float(np.mean(ratios))}
+    return {**out, "accuracy": float(np.nanmean(accuracies))} if accuracies else out
+
+
+def accuracy(found: Tensor, truth: Tensor) -> float:
+    """Balanced: the mean of the shares of free and of blocked rays that are found to be so."""
+    right = (found == truth).float()
+    return float(right[truth].mean() + right[~truth].mean()) / 2
+
+
+def misjudged(model: nn.Module, held: list[Source], encoding: str) -> dict[str, float]:
+    """Share of rays that stage 1 gets wrong, balanced, on whole meshes."""
+    found = []
+    for example in (source.example(encoding, None) for source in held):
+        logits = model(example.encoded, example.source, example.start)
+        found.append(1 - accuracy(logits > 0, example.visibility > 0.5))
+    return {"misjudged": float(np.nanmean(found)), "worst": float(np.nanmax(found))}
 
 
 def train(network: str, encoding: str, seed: int, kept: list[Source], held: list[Source], steps: int, log: Path,
-          teacher: nn.Module | None = None) -> nn.Module:
-    """Train, and write the log as we go."""
+          checkpoint: Path, teacher: nn.Module | None = None) -> nn.Module:
+    """Train, and write log and checkpoint as we go; on from the checkpoint, where there is one of just this.
+
+    Two stages are trained one after the other, the first with twice the steps, each of which costs less.
+    """
+    def drawn(rng: np.random.Generator, traced: bool) -> Example:
+        return kept[rng.integers(len(kept))].example(encoding, rng, traced)
+
+    def fit(model: Model, loss: loop.Loss, look: loop.Look, steps: int, stage: str = "") -> Model:
+        return loop.run(model, loss, look, steps=steps, rate=RATE, every=max(1, steps // LOOKS), seed=seed,
+                        checkpoint=checkpoint.with_name(checkpoint.name + stage),
+                        log=log.with_name(f"{log.stem}{stage}.csv"))
+
     torch.manual_seed(seed)
-    inputs = ENCODINGS[encoding][0]
-    model = NETWORKS[network](inputs)
-    optimiser = torch.optim.AdamW(model.parameters(), RATE, weight_decay=1e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=steps, pct_start=0.05)
-    began, losses = time.time(), []
-    log.parent.mkdir(exist_ok=True)
-    with log.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["step", "seconds", "loss", *Score._fields])
-        for step in trange(steps, desc=f"{network}, {encoding}, seed {seed}"):
-            rng = np.random.default_rng([seed, step])
-            example = kept[rng.integers(len(kept))].example(encoding, rng, traced=network == "gnn-paper")
-            loss = loss_of(network, model, example, teacher)
-            optimiser.zero_grad()
-            loss.backward()
-            nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-            optimiser.step()
-            schedule.step()
-            losses.append(loss.item())
-            if (step + 1) % EVERY == 0 or step + 1 == steps:
-                score = evaluate(model, held, encoding)
-                writer.writerow([step + 1, round(time.time() - began), round(float(np.mean(losses)), 4),
-                                 *(round(value, 5) for value in score)])
-                file.flush()
-                losses = []
-    return model
+    model = NETWORKS[network](ENCODINGS[encoding][0]).to(loop.device())
+    if isinstance(model, paper.TwoStage):
+        def seen(model: nn.Module, rng: np.random.Generator) -> Tensor:
+            example = drawn(rng, traced=True)
+            logits = model(example.encoded, example.source, example.start)
+            return balanced(logits[example.inner], example.visibility[example.inner], example.free)
+
+        model.visibility = fit(model.visibility, seen, lambda model: misjudged(model, held, encoding), 2 * steps,
+                               "-visibility")
+        model.visibility.requires_grad_(False)
+    return fit(model, lambda model, rng: loss_of(model, drawn(rng, traced=False), teacher),
+               lambda model: evaluate(model, held, encoding), steps)
+
+
+def sources(cache: Path, most: int) -> list[list[Source]]:
+    """Meshes to train on, and meshes held out; at most so many of both together. Empty lists where there are none."""
+    paths = [path for path in sorted(cache.glob("*.npz")) if data.is_whole(path)]
+    paths = [paths[i] for i in np.random.default_rng(0).permutation(len(paths))[:most]]
+    return [[Source(path) for path in part if path.stat().st_size < BYTES_A_POINT * MOST_POINTS]
+            for part in data.split(paths, HELD_OUT)]
 
 
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--network", choices=list(NETWORKS), default="gnn-paper")
-    parser.add_argument("--encoding", choices=list(ENCODINGS), default="motor")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int)
-    parser.add_argument("--meshes", type=int, default=400, help="at most, of the cache")
+    parser.add_argument("--meshes", type=int, default=600, help="at most, of the cache")
     parser.add_argument("--cache", type=Path, default=data.CACHE, help="of labelled meshes, from training.data")
     parser.add_argument("--out", type=Path, help="folder of the weights; none are written where not given")
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # steps are small, and a second thread that must wait loses tenfold
-    paths = [path for path in sorted(arguments.cache.glob("*.npz")) if data.is_whole(path)]
-    paths = [paths[i] for i in np.random.default_rng(0).permutation(len(paths))[:arguments.meshes]]
-    sets = [[Source(path) for path in part if path.stat().st_size < 100 * MOST_POINTS]
-            for part in data.split(paths, HELD_OUT)]
+    sets = sources(arguments.cache, arguments.meshes)
     if not all(sets):
         parser.error(f"there are too few labelled meshes in '{arguments.cache}'; make them with `make data`")
     teacher = None
@@ -207,16 +225,18 @@ def main() -> None:
         teacher = paper.TwoStage()
         arrays = weights.load(weights.FOLDER / "gnn-paper.safetensors")
         teacher.load_state_dict({name: torch.from_numpy(array.copy()) for name, array in arrays.items()})
-        teacher.eval()
-    log = Path(__file__).parent / "logs" / f"{arguments.network}-{arguments.encoding}-{arguments.seed}.csv"
-    steps = arguments.steps or STEPS[arguments.network]
-    model = train(arguments.network, arguments.encoding, arguments.seed, *sets, steps, log, teacher)
+        teacher.to(loop.device()).eval()
+    log = Path(__file__).parent / "logs" / f"{arguments.network}.csv"
+    model = train(arguments.network, "motor", arguments.seed, *sets, arguments.steps or STEPS[arguments.network], log,
+                  arguments.cache / f"{arguments.network}.checkpoint", teacher)
     draw(log, ["srr_median", "srr_mean"])
+    if arguments.network == "gnn-paper":
+        draw(log.with_name("gnn-paper-visibility.csv"), ["misjudged"])
     if arguments.out:
         arguments.out.mkdir(parents=True, exist_ok=True)
         weights.save(arguments.out / f"{arguments.network}.safetensors",
-                     {name: value.detach().numpy() for name, value in model.state_dict().items()})
-    print(f"{len(sets[0])} meshes, {len(sets[1])} held out: {evaluate(model, sets[1], arguments.encoding)}")
+                     {name: value.detach().cpu().numpy() for name, value in model.state_dict().items()})
+    print(f"{len(sets[0])} meshes, {len(sets[1])} held out: {evaluate(model, sets[1], 'motor')}")
 
 
 if __name__ == "__main__":

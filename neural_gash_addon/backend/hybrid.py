@@ -128,10 +128,11 @@ def _pass(cloud: Cloud, now: NDArray[np.float32], out: NDArray[np.float32], seen
         point, other, shape = point[some], other[some], shape[:, some]
     theirs = [row.take(other) for row in now]
     mine = [row.take(point) for row in now[:4]]
-    weight = weights_of(features(shape, mine, theirs, rays), layers, rays)
+    bands = sh.order_of(len(now))
+    weight = weights_of(features(shape, mine, theirs, rays), layers, rays, bands)
     begins = np.flatnonzero(np.concatenate([[True], point[1:] != point[:-1]]))
     rows = point[begins]
-    for band in range(sh.order_of(len(now))):
+    for band in range(bands):
         total = 1 + np.add.reduceat(weight[band], begins)
         for k in range(band * band, (band + 1) ** 2):
             theirs[k] *= weight[band]
@@ -176,11 +177,13 @@ def features(shape: NDArray[np.float32], mine: Sequence[NDArray], theirs: Sequen
     return out
 
 
-def weights_of(values: NDArray[np.float32], layers: Sequence[Layer], rays: int) -> NDArray[np.float32]:
+def weights_of(values: NDArray[np.float32], layers: Sequence[Layer], rays: int, bands: int) -> NDArray[np.float32]:
     """(bands, L) from `features`."""
     for number, layer in enumerate(layers):
         matrix = np.concatenate([layer.weight, layer.bias[None]]).T
         last = number + 1 == len(layers)
+        if last:
+            matrix = matrix[:bands]
         out = np.empty((len(matrix) + (not last), values.shape[1]), np.float32)
         out[len(matrix):] = 1
         for start in range(0, values.shape[1], _BLAS_COLUMNS):

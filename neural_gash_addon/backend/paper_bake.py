@@ -23,7 +23,8 @@ from .record import BakeRecord
 from .refine import refined
 from .transfer import Transfer
 
-ORDER = 3  # bands that the paper's networks give
+ORDER = 3   # bands that the paper's networks give
+SIDE = 8.0  # of what they are given: neighbours, a hundredth of a mesh apart, are then told apart as normals are
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -38,9 +39,9 @@ def import_torch(method: str) -> Any:
 
 
 def placed(points: NDArray) -> NDArray[np.float64]:
-    """Points (N, 3) as the networks know them: box centred on the origin, longest side 1."""
+    """Points (N, 3) as the networks know them: box centred on the origin, longest side SIDE."""
     low, high = points.min(0), points.max(0)
-    return (points - (low + high) / 2) / (float((high - low).max()) or 1.0)
+    return (points - (low + high) / 2) * (SIDE / (float((high - low).max()) or 1.0))
 
 
 def _bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,

@@ -11,7 +11,8 @@ torch = pytest.importorskip("torch")
 from neural_gash_addon.backend import conformal  # noqa: E402
 from neural_gash_addon.backend import spherical_harmonics as sh  # noqa: E402
 from neural_gash_addon.backend.exchange import write_npz  # noqa: E402
-from training import curves, gnn, labels, paper  # noqa: E402
+from neural_gash_addon.backend.networks import paper as networks  # noqa: E402
+from training import curves, gnn, labels, loop, paper  # noqa: E402
 
 
 @pytest.fixture(autouse=True)
@@ -39,29 +40,63 @@ def samples(cache):
     return [labels.load(path) for path in sorted(cache.glob("*.npz"))]
 
 
+def losses_of(log):
+    with log.open(newline="") as file:
+        return [float(row["loss"]) for row in csv.DictReader(file)]
+
+
+class Stopped(Exception):
+    pass
+
+
 def test_gnn_learns_and_goes_on_from_its_checkpoint(cache, tmp_path, monkeypatch):
     monkeypatch.setattr(gnn, "POINTS", 200)
-    monkeypatch.setattr(gnn, "WARM_UP", 5)
     monkeypatch.setattr(gnn, "EVERY", 8)
     known = samples(cache)
     whole = gnn.train(known, known, 16, 3, tmp_path / "one", tmp_path / "one.csv")
-    with (tmp_path / "one.csv").open(newline="") as file:
-        losses = [float(row["loss"]) for row in csv.DictReader(file)]
+    losses = losses_of(tmp_path / "one.csv")
     assert len(losses) == 2 and losses[1] < losses[0]
 
-    class Stopped(Exception):
-        pass
-
-    def stop(*arguments):
+    def save_and_stop(self, path, save=loop.Training.save):
+        save(self, path)
         raise Stopped
 
     with monkeypatch.context() as patch:
-        patch.setattr(gnn.Trainer, "save", lambda self, save=gnn.Trainer.save: (save(self), stop()))
+        patch.setattr(loop.Training, "save", save_and_stop)
         with pytest.raises(Stopped):
             gnn.train(known, known, 16, 3, tmp_path / "two", tmp_path / "two.csv")
     again = gnn.train(known, known, 16, 3, tmp_path / "two", tmp_path / "two.csv")
     for one, two in zip(whole.parameters(), again.parameters(), strict=True):
         np.testing.assert_allclose(two.detach(), one.detach(), atol=1e-6)
+
+
+def line(steps, tmp_path, look):
+    """Fit y = 3x; `look` judges."""
+    torch.manual_seed(0)
+    x = torch.linspace(-1, 1, 20)[:, None]
+    return loop.run(torch.nn.Linear(1, 1), lambda model, rng: (model(x) - 3 * x).square().mean(), look, steps=steps,
+                    rate=0.1, every=10, seed=0, checkpoint=tmp_path / "line", log=tmp_path / "line.csv")
+
+
+def test_the_best_of_a_training_is_kept_and_it_ends_where_nothing_more_comes(tmp_path):
+    scores = iter([3.0, 1.0, *[2.0] * 100])
+    seen = []
+
+    def look(model):
+        seen.append(model.weight.detach().clone())
+        return {"score": next(scores)}
+
+    model = line(1000, tmp_path, look)
+    assert len(seen) == 2 + loop.PATIENCE
+    torch.testing.assert_close(model.weight.detach(), seen[1])
+
+
+def test_a_checkpoint_of_another_training_is_not_gone_on_from(tmp_path, caplog):
+    error = {"score": 0.0}
+    line(100, tmp_path, lambda model: error)
+    line(60, tmp_path, lambda model: error)
+    assert "another training" in caplog.text
+    assert len(losses_of(tmp_path / "line.csv")) == 6
 
 
 @pytest.mark.parametrize("parts", [0.0, 1.0])
@@ -76,16 +111,23 @@ def test_gnn_examples_have_the_labels_of_their_frames(cache, parts):
         assert float(truth.square().sum()) == pytest.approx(float(np.square(blocked).sum()), rel=1e-3)
 
 
-@pytest.mark.parametrize("network", ["mlp", "gnn-paper", "end-to-end"])
+@pytest.mark.parametrize("network", ["mlp", "gnn-paper", "end-to-end", "student"])
 def test_the_papers_networks_learn(cache, tmp_path, network, monkeypatch):
-    monkeypatch.setattr(paper, "EVERY", 15)
     known = [paper.Source(path) for path in sorted(cache.glob("*.npz"))]
-    model = paper.train(network, "motor", 0, known, known, 30, tmp_path / "log.csv")
-    with (tmp_path / "log.csv").open(newline="") as file:
-        losses = [float(row["loss"]) for row in csv.DictReader(file)]
-    assert losses[-1] < losses[0]
-    assert np.isfinite(paper.evaluate(model, known, "motor").srr_median)
+    teacher = networks.TwoStage().eval() if network == "student" else None
+    monkeypatch.setattr(paper, "LOOKS", 2)
+    model = paper.train(network, "motor", 0, known, known, 40, tmp_path / "log.csv", tmp_path / "checkpoint", teacher)
+    for log in ["log.csv"] + ["log-visibility.csv"] * (network == "gnn-paper"):
+        losses = losses_of(tmp_path / log)
+        assert len(losses) == 2 and losses[-1] < losses[0]
+    assert np.isfinite(paper.evaluate(model, known, "motor")["srr_median"])
     assert curves.draw(tmp_path / "log.csv", ["srr_median"]).stat().st_size > 1000
+
+
+def test_balanced_accuracy_does_not_reward_the_larger_class():
+    truth = torch.tensor([True] * 9 + [False])
+    assert paper.accuracy(torch.ones(10, dtype=bool), truth) == 0.5
+    assert paper.accuracy(truth, truth) == 1
 
 
 @pytest.mark.parametrize("encoding", list(paper.ENCODINGS))
