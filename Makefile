@@ -4,7 +4,8 @@
 # make test-window BLENDER=…   try the panel and the bake in an open Blender (see tests/window/session.py)
 # make data    label meshes to train on, in training/cache/ (COUNT=2000 SEED=1 FOLDER=… for more)
 # make lint, package, bench, docs-pictures, clean: as they say
-.PHONY: data demo docs-pictures test test-window lint package bench clean system-packages
+# make train NETWORK=gnn   label meshes and train from nothing: gnn, hybrid, gnn-paper, mlp, end-to-end or student
+.PHONY: data train demo docs-pictures test test-window lint package bench clean system-packages
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 PY := .venv/bin/python
 # Debian's names of what bpy loads; EEVEE renders without a display through EGL and llvmpipe
@@ -52,6 +53,10 @@ COUNT ?= 2000
 SEED ?= 1
 data: .venv/ready
 	$(PY) -m training.data --count $(COUNT) --seed $(SEED) $(if $(FOLDER),--folder "$(FOLDER)")
+
+NETWORK ?= gnn
+train: data
+	$(PY) -m training.$(if $(filter gnn hybrid,$(NETWORK)),$(NETWORK),paper --network $(NETWORK))
 
 clean:
 	rm -rf .venv .venv52 build dist out .pytest_cache .mypy_cache .ruff_cache

@@ -16,15 +16,21 @@ import numpy as np
 from meshes import FOLDER, read
 from table import Table, seconds
 
-from neural_gash_addon.backend import methods, metrics
+from neural_gash_addon.backend import conformal, methods, metrics, paper_bake, weights
 from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.geometry import TriangleMesh
+from neural_gash_addon.backend.graph import graph
+from neural_gash_addon.backend.neighbours import neighbours
+from neural_gash_addon.backend.raycast import Occluders
 from neural_gash_addon.backend.workers import default_threads
+from training import labels
+from training.paper import accuracy
 
 ORDER, REFERENCE_RAYS, REPEATS = 3, 2048, 3
 RAYS = (4, 8, 16, 32)  # of Embree, beside
 ENOUGH = 1.0           # seconds of a bake that is not repeated
 MOST_SRR, MOST_OVER, MOST_COST = 0.35, 1.05, 15.0  # asked for: over all, on the worst mesh, µs a vertex
+LEAST_ACCURACY = 0.8   # and of the paper's visibilities, on organic meshes
 
 NETWORKS = [name for name, method in methods.METHODS.items() if name != "analytic" and not method.traces]
 COLUMNS: list[tuple[str, int | None]] = [*((name, None) for name in NETWORKS), *(("embree", rays) for rays in RAYS)]
@@ -33,6 +39,24 @@ COLUMNS: list[tuple[str, int | None]] = [*((name, None) for name in NETWORKS), *
 def label(method: str, rays: int | None) -> str:
     """A column's heading."""
     return method if rays is None else f"{method} {rays}"
+
+
+def visibility_accuracy(mesh: TriangleMesh) -> float:
+    """Of stage 1 of `gnn-paper`: the mean of the shares of free and of blocked rays that it finds to be so."""
+    import torch
+
+    from neural_gash_addon.backend.networks import paper
+
+    network = paper.TwoStage()
+    network.load_state_dict({name: torch.from_numpy(array.copy()) for name, array
+                             in weights.load(weights.FOLDER / "gnn-paper.safetensors").items()})
+    edges = graph(mesh.points, neighbours(mesh))
+    encoded = conformal.encode(paper_bake.placed(mesh.points), mesh.normals).astype(np.float32)
+    with torch.no_grad():
+        logits = network.eval().visibility(*(torch.from_numpy(a) for a in (encoded, edges.source, edges.start)))
+    scene = Occluders([(mesh.positions, mesh.triangles)], mesh.resolution)
+    truth = labels.visible(mesh, scene, conformal.hemisphere_directions(), labels.motor_frames)
+    return accuracy(logits > 0, torch.from_numpy(truth))
 
 
 def measure(mesh: TriangleMesh, unshadowed: np.ndarray, reference: np.ndarray
@@ -74,6 +98,7 @@ def main() -> None:
           + " | ".join(f"{n} µs" for n in names) + " |")
     print("|---" * (3 + 2 * len(names)) + "|", flush=True)
     found: list[tuple[str, dict[str, float], dict[str, float], dict[str, np.ndarray]]] = []
+    seen: dict[str, list[float]] = {}
     for path in sorted(arguments.folder.glob("*.ply")):
         if arguments.only and arguments.only not in path.stem:
             continue
@@ -83,6 +108,8 @@ def main() -> None:
         errors, costs, residuals = measure(mesh, unshadowed, reference)
         category = categories.get(path.stem, "")
         found.append((category, errors, costs, residuals))
+        if "gnn-paper" in NETWORKS:
+            seen.setdefault(category, []).append(visibility_accuracy(mesh))
         print(f"| {path.stem} | {category} | {len(mesh.points):,} | " + " | ".join(f"{errors[n]:.4f}" for n in names)
               + " | " + " | ".join(f"{costs[n]:.1f}" for n in names) + " |", flush=True)
     for category in [*sorted({c for c, *_ in found}), ""]:
@@ -100,6 +127,10 @@ def main() -> None:
         costs = [cost[name] for _, _, cost, _ in found]
         table.add("µs a vertex, median", "", "", float(np.median(costs)), MOST_COST, unit=" µs", most=True)
         table.add("µs a vertex, dearest mesh", "", "", max(costs), unit=" µs")
+    table.heading("Visibility of gnn-paper", "Balanced accuracy, mean over the meshes of a category (figure 11).")
+    for category, values in sorted(seen.items()):
+        table.add(category or "all", "", "", float(np.mean(values)),
+                  LEAST_ACCURACY if category == "organic" else None, unit="")
     print("\nError of each coefficient over all vertices of all meshes (the paper's figures 9 and 10):\n")
     print("| network | measure | " + " | ".join(str(k) for k in range(ORDER ** 2)) + " |")
     print("|---" * (2 + ORDER ** 2) + "|")

@@ -15,12 +15,12 @@ import os
 import sys
 import time
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import trimesh
@@ -32,6 +32,7 @@ from neural_gash_addon.backend.exchange import write_npz
 from . import labels, meshes
 from .solids import Mesh, weld
 
+Made = TypeVar("Made")
 CACHE = Path(__file__).resolve().parent / "cache"
 SUFFIXES = (".ply", ".obj", ".stl")
 MOTOR_FRAMES = "training.labels:motor_frames"
@@ -198,6 +199,24 @@ def split(paths: Sequence[Path], fraction: float, seed: int = 0) -> tuple[list[P
     held = [is_held_out(path.stem.rpartition("-")[0], fraction, seed) for path in paths]
     return ([p for p, out in zip(paths, held, strict=True) if not out],
             [p for p, out in zip(paths, held, strict=True) if out])
+
+
+def sources(make: Callable[[Path], Made], cache: Path, most: int, most_points: int, fraction: float
+            ) -> list[list[Made]]:
+    """Meshes to train on and meshes held out, each made of its file; empty lists where there are none.
+
+    Args:
+        most: files to take of all that are in the cache, which ones by lot, always the same.
+        most_points: of a mesh; larger ones are passed over.
+    """
+    paths = [path for path in sorted(cache.glob("*.npz")) if is_whole(path)]
+    paths = [paths[i] for i in np.random.default_rng(0).permutation(len(paths))[:most]]
+    return [[make(path) for path in part if _points(path) <= most_points] for part in split(paths, fraction)]
+
+
+def _points(path: Path) -> int:
+    with np.load(path) as found:
+        return len(found["normals"])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

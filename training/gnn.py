@@ -126,13 +126,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--meshes", type=int, default=600, help="at most, of the cache")
     parser.add_argument("--cache", type=Path, default=data.CACHE, help="of labelled meshes, from training.data")
     parser.add_argument("--out", type=Path, default=weights.FOLDER, help="folder of the weights")
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # steps are small, and a second thread that must wait loses tenfold
-    paths = [path for path in sorted(arguments.cache.glob("*.npz")) if data.is_whole(path)]
-    sets = [[sample for sample in map(labels.load, part) if len(sample.positions) <= MOST_POINTS]
-            for part in data.split(paths, HELD_OUT)]
+    sets = data.sources(labels.load, arguments.cache, arguments.meshes, MOST_POINTS, HELD_OUT)
     if not all(sets):
         parser.error(f"there are too few labelled meshes in '{arguments.cache}'; make them with `make data`")
     log = Path(__file__).parent / "logs" / "gnn.csv"

@@ -1,68 +1,93 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Train the hybrid's network from nothing: `python -m training.hybrid`; writes the weights that ship, log and curves.
+"""Train the hybrid from nothing: `make data`, then `python -m training.hybrid`; writes weights, log and curves.
 
-The torch module below is the twin of `backend.hybrid.filtered` (a test holds them to 1e-5); gradients
-flow through all passes.
+The torch module below is the twin of `backend.hybrid.filtered` (a test holds them to 1e-5); gradients flow through both
+passes. What few rays see is traced anew in every step, so no noise is seen twice.
 """
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from neural_gash_addon.backend import hybrid, weights
 from neural_gash_addon.backend import spherical_harmonics as sh
+from neural_gash_addon.backend.estimator import BlockedEstimator
+from neural_gash_addon.backend.geometry import TriangleMesh
+from neural_gash_addon.backend.raycast import Occluders
 
-from . import hybrid_data, loop
+from . import data, labels, loop
 from .curves import draw
 
-PASSES, HIDDEN = 2, 16
-PATCH = 6000          # points of a training example: neighbouring ones of one mesh
-STEPS, RATE = 7000, 4e-3
-HELD_OUT = 6          # every so many-eth mesh is not trained on
+PASSES, HIDDEN = 2, 32
+RAYS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128, 256)
+PATCH = 2048          # points of a training example: neighbouring ones of one mesh
+STEPS, RATE, EVERY = 1600, 5e-3, 200
+MOST_POINTS = 30_000  # of a mesh
+HELD_OUT = 0.1
 FLOOR = 1e-4          # of the blocked energy: the reference's own noise
 
 
 class Filter(nn.Module):
-    """The passes."""
+    """Both passes."""
 
-    def __init__(self, passes: int = PASSES, hidden: int = HIDDEN, order: int = hybrid_data.ORDER) -> None:
+    def __init__(self, passes: int = PASSES, hidden: int = HIDDEN) -> None:
         super().__init__()
-        self.order = order
+        outputs = hybrid.FORMS + labels.ORDER
         self.passes = nn.ModuleList(
-            nn.Sequential(nn.Linear(hybrid.FEATURES, hidden), nn.ReLU(), nn.Linear(hidden, order))
+            nn.Sequential(nn.Linear(hybrid.CONTEXT, hidden), nn.ReLU(), nn.Linear(hidden, outputs))
             for _ in range(passes))
+        for network in self.passes:
+            nn.init.constant_(network[-1].bias, 1.0)
 
-    def forward(self, points: Tensor, normals: Tensor, point: Tensor, other: Tensor, blocked: Tensor,
-                unshadowed: Tensor, rays: int) -> list[Tensor]:
-        """The blocked part (N, K) after each pass; point, other: (L,) pairs of neighbours."""
-        order = sh.order_of(blocked.shape[1])
-        bands = torch.repeat_interleave(torch.arange(order), 2 * torch.arange(order) + 1)
-        away = points[other] - points[point]
-        square = (away * away).sum(1) + 1e-14
-        inverse = square.rsqrt()
-        one, two = normals[point], normals[other]
-        still = torch.stack([(one * two).sum(1), (one * away).sum(1) * inverse, -(two * away).sum(1) * inverse,
-                             0.25 * square.log(), torch.full_like(square, 0.5 * float(np.log(rays)))], 1)
+    def forward(self, places: Tensor, normals: Tensor, orders: list[Tensor], blocked: Tensor, unshadowed: Tensor,
+                rays: int) -> list[Tensor]:
+        """The blocked part (N, K) after each pass."""
         even = torch.cat([torch.zeros(len(blocked), 1), unshadowed[:, 1:] / hybrid.FULL], 1)
         now, out = blocked - blocked[:, :1] * even, []
-        for network in self.passes:
-            mine, theirs = now[point], now[other]
-            difference = (mine[:, :4] - theirs[:, :4]).square()
-            moving = torch.stack([0.25 * (difference[:, 0] + hybrid._TINY).log(),
-                                  0.25 * (difference[:, 1:].sum(1) + hybrid._TINY).log(),
-                                  4 * mine[:, 0], 4 * theirs[:, 0]], 1)
-            given = network(torch.cat([still, moving], 1)).clamp(hybrid.LEAST, hybrid.MOST).exp()[:, :order]
-            given = given * (hybrid.HALF / (hybrid.HALF + rays))
-            given = given * ((mine[:, 0] != 0) | (theirs[:, 0] != 0))[:, None]
-            total = torch.ones(len(now), order).index_add(0, point, given)
-            sums = now.index_add(0, point, theirs * given[:, bands])
-            now = sums / total[:, bands]
+        for order, network in zip(orders, self.passes, strict=True):
+            parts = []
+            whole = len(order) - len(order) % hybrid.SIZE
+            for rows, size in ((order[:whole], hybrid.SIZE), (order[whole:], len(order) - whole)):
+                if len(rows):
+                    here = rows.view(-1, size)
+                    parts.append(self._mixed(places[here], normals[here], now[here], rays, network).flatten(0, 1))
+            now = torch.empty_like(now).index_copy(0, order, torch.cat(parts))
             out.append(now + now[:, :1] * even)
         return out
+
+    @staticmethod
+    def _mixed(places: Tensor, normals: Tensor, values: Tensor, rays: int, network: nn.Module) -> Tensor:
+        bands = sh.order_of(values.shape[2])
+        away = places - places.mean(1, keepdim=True)
+        size = away.square().sum((1, 2)).div(away.shape[1]).sqrt() + 1e-9
+        away = away / size[:, None, None]
+        share = values[..., 0]
+        context = torch.stack([
+            0.5 * size.log(), 2 * normals.mean(1).square().sum(1), 4 * share.mean(1),
+            0.5 * (share.var(1, unbiased=False) + hybrid.TINY).log(),
+            0.5 * (values[..., 1:4].var(1, unbiased=False).sum(1) + hybrid.TINY).log(),
+            torch.full_like(size, 0.5 * float(np.log(rays))),
+            torch.full_like(size, float(np.log(values.shape[1])) - 3)], 1)
+        given = network(context).clamp(hybrid.LEAST, hybrid.MOST).exp()
+        distance, plane, facing, first, second = given[:, :hybrid.FORMS].T[..., None, None]
+        apart = away[:, :, None] - away[:, None]  # (b, i, j, 3)
+        differ = (values[:, :, None, :4] - values[:, None, :, :4]).square()
+        form = (distance * apart.square().sum(-1) + facing * (1 - normals @ normals.swapaxes(1, 2))
+                + first * differ[..., 0] + second * differ[..., 1:].sum(-1)
+                + plane * (apart * normals[:, :, None]).sum(-1).square())
+        weight = torch.exp(-form.clamp_min(0))
+        # as it seems to the blocks of which all is open, which NumPy leaves alone
+        seen = (share != 0).any(1)[:, None, None]
+        band = torch.repeat_interleave(torch.arange(bands), 2 * torch.arange(bands) + 1)
+        own = given[:, hybrid.FORMS:][:, band][:, None] * ((hybrid.HALF + rays) / hybrid.HALF)
+        mean = (own * values + weight @ values) / (own + weight.sum(2, keepdim=True))
+        return torch.where(seen, mean, values)
 
     def network(self) -> hybrid.Network:
         """The same for NumPy."""
@@ -70,32 +95,43 @@ class Filter(nn.Module):
                  for layer in network if isinstance(layer, nn.Linear)] for network in self.passes]
 
 
-class Example:
-    """One mesh's data."""
+class Source:
+    """A labelled mesh, and what traces it."""
 
     def __init__(self, path: Path) -> None:
-        found = np.load(path)
-        self.name = path.stem.rsplit("-", 1)[0]
-        self.points = hybrid.normalised(found["points"]).astype(np.float32)
-        self.normals = found["normals"]
-        self.point = np.repeat(np.arange(len(self.points)), np.diff(found["start"]))
-        self.other = found["links"].astype(np.int64)
-        self.blocked = {rays: found[f"rays_{rays}"] for rays in hybrid_data.RAYS}
-        self.reference = found["reference"]
-        self.unshadowed = sh.cosine_lobe(self.normals, hybrid_data.ORDER).astype(np.float32)
+        sample = labels.load(path)
+        self.mesh = TriangleMesh.from_triangles(sample.positions, sample.triangles)
+        lit = np.any(sample.normals != 0, axis=1)
+        self.mesh = replace(self.mesh, points=sample.positions[lit].astype(np.float64),
+                            normals=sample.normals[lit].astype(np.float64),
+                            clearance=sample.normals[lit].astype(np.float64))
+        self.unshadowed = sample.unshadowed[lit].astype(np.float32)
+        self.truth = (sample.unshadowed - sample.coefficients)[lit].astype(np.float32)
+        self.places, self.normals = hybrid.placed(self.mesh.points, self.mesh.normals)
+        self.scene: Occluders | None = None  # made when it is first traced
 
-    def batch(self, rays: int, rng: np.random.Generator | None) -> tuple:
-        """Tensors for `Filter.forward`, and the reference; a patch of the mesh where a generator is given."""
-        kept = np.ones(len(self.points), bool)
-        if rng is not None and len(kept) > PATCH:
-            away = np.square(self.points - self.points[rng.integers(len(kept))]).sum(1)
-            kept = away <= np.partition(away, PATCH)[PATCH]
-        row = np.cumsum(kept) - 1
-        links = kept[self.point] & kept[self.other]
-        tensors = (self.points[kept], self.normals[kept], row[self.point[links]], row[self.other[links]],
-                   self.blocked[rays][kept], self.unshadowed[kept], self.reference[kept])
-        *given, truth = (torch.from_numpy(np.ascontiguousarray(t)) for t in tensors)
-        return (*given, rays), truth
+    def batch(self, rays: int, rng: np.random.Generator, patch: int, order: int = labels.ORDER) -> tuple[tuple, Tensor]:
+        """Arguments for `Filter.forward`, and the truth (n, K); of a patch of the mesh, or of all if that is less."""
+        points = self.mesh.points
+        rows = np.arange(len(points))
+        if len(rows) > patch:
+            away = np.square(points - points[rng.integers(len(rows))]).sum(1)
+            rows = np.argpartition(away, patch)[:patch]
+        if self.scene is None:
+            self.scene = Occluders([(self.mesh.positions, self.mesh.triangles)])
+        mesh = replace(self.mesh, points=points[rows], normals=self.mesh.normals[rows],
+                       clearance=self.mesh.clearance[rows])
+        estimator = BlockedEstimator(mesh, self.scene, order, int(rng.integers(2**31)), rays)
+        every = np.arange(len(rows))
+        local = estimator.means(every, estimator.summed(every, 0, rays), 0, rays)
+        blocked = estimator.turned_here(every, local)
+        places = self.places[rows]
+        turned = places @ Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
+        terms = order * order
+        arrays = places, self.normals[rows], blocked, self.unshadowed[rows, :terms], self.truth[rows, :terms]
+        places, normals, blocked, unshadowed, truth = (torch.from_numpy(np.ascontiguousarray(a, np.float32))
+                                                       for a in arrays)
+        return (places, normals, [torch.from_numpy(o) for o in hybrid.curves(turned)], blocked, unshadowed, rays), truth
 
 
 def srr(found: Tensor, truth: Tensor) -> Tensor:
@@ -103,30 +139,28 @@ def srr(found: Tensor, truth: Tensor) -> Tensor:
     return (found - truth).square().sum() / truth.square().sum().clamp_min(1e-12)
 
 
-def evaluate(model: nn.Module, examples: list[Example], order: int = 3) -> dict[int, tuple[float, float]]:
-    """Median SRR before and after, by rays."""
+def evaluate(model: nn.Module, held: list[Source]) -> dict[int, tuple[float, float]]:
+    """Median SRR before and after, by rays; order 3, always the same rays."""
     out = {}
-    terms = order * order
     with torch.no_grad():
-        for rays in hybrid_data.RAYS:
+        for rays in (2, 4, 8, 16, 32):
             found = []
-            for example in examples:
-                given, truth = example.batch(rays, None)
-                given = (*given[:4], given[4][:, :terms].contiguous(), given[5][:, :terms].contiguous(), rays)
-                after = model(*given)[-1]
-                found.append((float(srr(given[4], truth[:, :terms])), float(srr(after, truth[:, :terms]))))
+            for number, source in enumerate(held):
+                given, truth = source.batch(rays, np.random.default_rng([rays, number]), PATCH, 3)
+                if float(truth.square().sum()) >= 1e-6 * len(truth):
+                    found.append((float(srr(given[3], truth)), float(srr(model(*given)[-1], truth))))
             out[rays] = tuple(np.median(found, axis=0))
     return out
 
 
-def train(kept: list[Example], held: list[Example], steps: int, checkpoint: Path, log: Path, passes: int = PASSES,
-          hidden: int = HIDDEN, seed: int = 0) -> Filter:
+def train(kept: list[Source], held: list[Source], steps: int, seed: int, checkpoint: Path, log: Path,
+          hidden: int = HIDDEN) -> Filter:
     """Train, and write log and checkpoint as we go; on from the checkpoint, where there is one of just this."""
     torch.manual_seed(seed)
 
     def loss_of(model: nn.Module, rng: np.random.Generator) -> Tensor:
         while True:
-            given, truth = kept[rng.integers(len(kept))].batch(int(rng.choice(hybrid_data.RAYS)), rng)
+            given, truth = kept[rng.integers(len(kept))].batch(int(rng.choice(RAYS)), rng, PATCH)
             if float(truth.square().sum()) >= 1e-6 * len(truth):  # nothing to learn where nothing is blocked
                 break
         found = model(*given)
@@ -134,11 +168,11 @@ def train(kept: list[Example], held: list[Example], steps: int, checkpoint: Path
 
     def look(model: nn.Module) -> dict[str, float]:
         found = {rays: after for rays, (_, after) in evaluate(model, held).items()}
-        mean = float(np.exp(np.mean(np.log(list(found.values())))))
-        return {"srr": mean, **{f"srr_{rays}": after for rays, after in found.items()}}
+        return {"srr": float(np.exp(np.mean(np.log(list(found.values()))))),
+                **{f"srr_{rays}": after for rays, after in found.items()}}
 
-    # patches are small and of irregular shape: a GPU would wait for them
-    return loop.run(Filter(passes, hidden), loss_of, look, steps=steps, rate=RATE, every=500, seed=seed,
+    # on the CPU even beside a GPU: a step is a few milliseconds of each, and the rays are traced here
+    return loop.run(Filter(hidden=hidden), loss_of, look, steps=steps, rate=RATE, every=min(EVERY, steps), seed=seed,
                     checkpoint=checkpoint, log=log)
 
 
@@ -146,22 +180,23 @@ def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=STEPS)
-    parser.add_argument("--passes", type=int, default=PASSES)
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--hidden", type=int, default=HIDDEN)
+    parser.add_argument("--meshes", type=int, default=300, help="at most, of the cache")
+    parser.add_argument("--cache", type=Path, default=data.CACHE, help="of labelled meshes, from training.data")
     parser.add_argument("--out", type=Path, default=weights.FOLDER, help="folder of the weights")
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # steps are small: a second thread gains a third, and loses tenfold where it must wait
-    paths = sorted(hybrid_data.CACHE.glob("*.npz"))
-    examples = [Example(path) for path in paths]
-    held = examples[::HELD_OUT]
-    kept = [e for e in examples if e not in held]
+    sets = data.sources(Source, arguments.cache, arguments.meshes, MOST_POINTS, HELD_OUT)
+    if not all(sets):
+        parser.error(f"there are too few labelled meshes in '{arguments.cache}'; make them with `make data`")
     log = Path(__file__).parent / "logs" / "hybrid.csv"
-    model = train(kept, held, arguments.steps, hybrid_data.CACHE / "hybrid.checkpoint", log, arguments.passes,
-                  arguments.hidden)
+    model = train(*sets, arguments.steps, arguments.seed, arguments.cache / "hybrid.checkpoint", log, arguments.hidden)
     draw(log, [f"srr_{rays}" for rays in (2, 4, 8, 16, 32)])
     arguments.out.mkdir(parents=True, exist_ok=True)
     weights.save_hybrid(arguments.out / weights.HYBRID, model.network())
-    for rays, (before, after) in evaluate(model, held).items():
+    print(f"{len(sets[0])} meshes, {len(sets[1])} held out")
+    for rays, (before, after) in evaluate(model, sets[1]).items():
         print(f"{rays:4d} rays: SRR {before:.4f} -> {after:.4f}")
 
 

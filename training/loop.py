@@ -111,7 +111,7 @@ class Training:
         else:
             self.since += 1
         self.rows.append({"step": self.step, "seconds": round(self.seconds), "loss": round(loss, 4),
-                          **{key: round(value, 5) for key, value in found.items()}})
+                          **{key: round(float(value), 5) for key, value in found.items()}})
 
 
 def run(model: Model, loss_of: Loss, look: Look, *, steps: int, rate: float, every: int, seed: int,

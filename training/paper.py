@@ -36,12 +36,13 @@ ENCODINGS: dict[str, tuple[int, Callable[[np.ndarray, np.ndarray], np.ndarray]]]
 }
 NETWORKS: dict[str, Callable[[int], nn.Module]] = {
     "mlp": paper.Mlp, "gnn-paper": paper.TwoStage, "end-to-end": paper.CoefficientsNet, "student": paper.Mlp}
+SHIPPED = ("mlp", "gnn-paper")
 Model = TypeVar("Model", bound=nn.Module)
 STEPS = {"mlp": 3000, "student": 3000, "gnn-paper": 4000, "end-to-end": 2000}
 RATE, PATCH, HELD_OUT, LOOKS = 2e-3, 1500, 0.1, 20
 INNER = 0.6            # of a patch's points count: around the others there is too little of the mesh
 SCALES = (0.8, 1.25)
-MOST_POINTS, BYTES_A_POINT = 30_000, 100  # of a mesh, and what its file takes
+MOST_POINTS = 30_000   # of a mesh
 FLOOR = 3e-4  # of the unshadowed energy, as in training.gnn
 
 
@@ -199,11 +200,8 @@ def train(network: str, encoding: str, seed: int, kept: list[Source], held: list
 
 
 def sources(cache: Path, most: int) -> list[list[Source]]:
-    """Meshes to train on, and meshes held out; at most so many of both together. Empty lists where there are none."""
-    paths = [path for path in sorted(cache.glob("*.npz")) if data.is_whole(path)]
-    paths = [paths[i] for i in np.random.default_rng(0).permutation(len(paths))[:most]]
-    return [[Source(path) for path in part if path.stat().st_size < BYTES_A_POINT * MOST_POINTS]
-            for part in data.split(paths, HELD_OUT)]
+    """Meshes to train on, and meshes held out; at most so many of both together."""
+    return data.sources(Source, cache, most, MOST_POINTS, HELD_OUT)
 
 
 def main() -> None:
@@ -214,7 +212,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int)
     parser.add_argument("--meshes", type=int, default=600, help="at most, of the cache")
     parser.add_argument("--cache", type=Path, default=data.CACHE, help="of labelled meshes, from training.data")
-    parser.add_argument("--out", type=Path, help="folder of the weights; none are written where not given")
+    parser.add_argument("--out", type=Path, help="folder of the weights; not given: the add-on's, if they ship")
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # steps are small, and a second thread that must wait loses tenfold
     sets = sources(arguments.cache, arguments.meshes)
@@ -232,10 +230,10 @@ def main() -> None:
     draw(log, ["srr_median", "srr_mean"])
     if arguments.network == "gnn-paper":
         draw(log.with_name("gnn-paper-visibility.csv"), ["misjudged"])
-    if arguments.out:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        weights.save(arguments.out / f"{arguments.network}.safetensors",
-                     {name: value.detach().cpu().numpy() for name, value in model.state_dict().items()})
+    out = arguments.out or (weights.FOLDER if arguments.network in SHIPPED else arguments.cache)
+    out.mkdir(parents=True, exist_ok=True)
+    weights.save(out / f"{arguments.network}.safetensors",
+                 {name: value.detach().cpu().numpy() for name, value in model.state_dict().items()})
     print(f"{len(sets[0])} meshes, {len(sets[1])} held out: {evaluate(model, sets[1], 'motor')}")
 
 

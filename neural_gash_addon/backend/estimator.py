@@ -177,7 +177,9 @@ def morton_order(points: NDArray) -> NDArray[np.int64]:
     """Indices (N,) that walk the points (N, 3) along a Z-order curve: neighbours in it are near in space."""
     low = points.min(0)
     extent = float((points.max(0) - low).max()) or 1.0
-    cells = np.minimum((points - low) / extent * 2**20, 2**20 - 1).astype(np.uint64)
+    # not at the corner of the cube that the curve fills: planes of symmetry would lie between its halves, and rounding
+    # would decide on which side a point is
+    cells = ((0.0618 + 0.8 * (points - low) / extent) * 2**20).astype(np.uint64)
     code = np.zeros(len(points), dtype=np.uint64)
     for axis in range(3):
         x = cells[:, axis]

@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Few rays, and a small network that says how much of its neighbours' blocked part each point takes.
 
-Every point's blocked part B_i is traced with few rays. In each of PASSES passes it becomes a mean of
-its own and its neighbours', band by band: (B_i + sum_j w_ij B_j) / (1 + sum_j w_ij). The network
-gives log w_ij from numbers that do not change when the mesh is turned, moved or scaled: so the
-answer turns with the mesh. Weights fall as 1 / rays, so with many rays the traced value stays.
-Where nothing was blocked in a neighbourhood, nothing is computed.
+Every point's blocked part B_i is traced with few rays. Points are then laid along a space-filling curve and cut into
+blocks of SIZE (after Wu et al. 2024, "Point Transformer V3": neighbours by sorting, not by searching). Within a block,
+band by band, each becomes a mean, (s B_i + sum_j w_ij B_j) / (s + sum_j w_ij), where -log w_ij is a quadratic form of
+how far apart two points are, how far one is off the other's tangent plane, how they face, and how what the rays saw
+differs. The coefficients of that form, and s, are what the network gives, once for each block. A second pass does the
+same along another curve, whose blocks have their borders elsewhere.
 
-The network is a perceptron with one hidden layer, 245 numbers a pass; it runs in NumPy.
+Nothing in it changes when the mesh is moved or scaled, or turned (the curves are laid in axes of its own): so the
+answer turns with the mesh. s grows with the rays: with many, the traced value stays. Where nothing was blocked in a
+block, nothing is computed.
+
+The network is a perceptron with one hidden layer for each pass; it runs in NumPy.
 """
 from __future__ import annotations
 
@@ -19,15 +24,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import spherical_harmonics as sh
-from .neighbours import Neighbours
+from .estimator import morton_order
+from .geometry import unit
 
-FEATURES = 9
+SIZE = 32                 # points of a block
+CONTEXT = 7               # numbers that the network sees of a block, see `_context`
+FORMS = 5                 # coefficients of the form: distance, tangent plane, normals, band 0, band 1
 FULL = 0.5 / np.pi ** 0.5  # coefficient 0 of a point of which all is blocked
-MOST, LEAST = 4.0, -12.0  # of log w
-HALF = 64.0               # rays at which weights are halved
-_TINY = 1e-5              # of a squared difference: below noise of any ray count
-_MOST_POINTS = 4096            # at a time: less, and threads wait for the interpreter; more, and the cache runs over
-_BLAS_COLUMNS = 1024      # of one matrix product: small enough for BLAS to stay on the calling thread
+LEAST, MOST = -6.0, 12.0  # of the logarithms that the network gives
+HALF = 64.0               # rays at which s is twice what it is with none
+TINY = 1e-6               # of a variance: below the noise of any number of rays
+_BLOCKS = 16, 128         # at a time, at least and at most: less is all overhead, more overflows the cache
+_TURN = np.array([[0.8, -0.48, 0.36], [0.6, 0.64, -0.48], [0.0, 0.6, 0.8]])  # of the second curve
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,39 +49,36 @@ class Layer:
 Network = Sequence[Sequence[Layer]]  # of each pass, its layers
 
 
-@dataclass(frozen=True, eq=False)
-class Cloud:
-    """N points and their L neighbours: what stays the same from pass to pass."""
+def placed(points: NDArray, normals: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points (N, 3) about their mean and normals (N, 3), in axes of their own; unit: twice the reach of the farthest.
 
-    links: Neighbours
-    shape: NDArray[np.float32]  # (4, L) features of a pair that do not change from pass to pass
-
-    @staticmethod
-    def of(points: NDArray, normals: NDArray, links: Neighbours, pool: ThreadPoolExecutor) -> Cloud:
-        """Points (N, 3) and unit normals (N, 3) of any size and place."""
-        places = np.ascontiguousarray(normalised(points).T, dtype=np.float32)
-        shape = np.empty((4, len(links.points)), np.float32)
-        turned = np.ascontiguousarray(normals.T, dtype=np.float32)
-
-        step = _step(len(points))
-
-        def part(start: int) -> None:
-            point, other, edges = _pairs(links, start, min(start + step, len(points)))
-            shape[:, edges] = pair_shape(places, turned, point, other)
-
-        list(pool.map(part, range(0, len(points), step)))
-        return Cloud(links, shape)
-
-
-def normalised(points: NDArray) -> NDArray[np.float64]:
-    """Points (N, 3) about their mean, in units of twice the distance of the farthest: the same however turned."""
+    The first axis leads to the farthest point, the second to the one that is farthest from it. So they are the same
+    however they are turned, moved and scaled; and however they are listed, unless several points are equally far: of
+    those, the first counts.
+    """
     away = points - points.mean(0)
-    extent = 2 * float(np.sqrt(np.square(away).sum(1).max(initial=0.0)))
-    return away / (extent or 1.0)
+    reach = np.sqrt(np.square(away).sum(1))
+    most = float(reach.max(initial=0.0)) or 1.0
+    one = unit(away[_first_of_the_greatest(reach)])
+    off = away - (away @ one)[:, None] * one
+    two = unit(off[_first_of_the_greatest(np.square(off).sum(1))])
+    axes = np.stack([one, two, np.cross(one, two)], 1)
+    return away @ axes / (2 * most), normals @ axes
 
 
-def filtered(cloud: Cloud, blocked: NDArray[np.float32], unshadowed: NDArray[np.float32], rays: int, network: Network,
-             pool: ThreadPoolExecutor) -> NDArray[np.float32]:
+def _first_of_the_greatest(values: NDArray) -> int:
+    """Of (N,), rounding aside."""
+    return int(np.argmax(values >= values.max() * (1 - 1e-9)))
+
+
+def curves(places: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """For each pass, indices (N,) that walk the points (N, 3), `placed`, along a curve."""
+    return morton_order(places), morton_order(places @ _TURN)
+
+
+def filtered(places: NDArray, normals: NDArray, orders: Sequence[NDArray], blocked: NDArray[np.float32],
+             unshadowed: NDArray[np.float32], rays: int, network: Network, pool: ThreadPoolExecutor
+             ) -> NDArray[np.float32]:
     """The blocked part of all points after all passes.
 
     What is passed on is the share that is blocked (in coefficient 0), and how the rest differs from
@@ -81,126 +86,130 @@ def filtered(cloud: Cloud, blocked: NDArray[np.float32], unshadowed: NDArray[np.
     be here if its sky were blocked evenly. Exact where all is blocked, or nothing.
 
     Args:
+        places, normals: (N, 3) from `placed`. orders: from `curves`.
         blocked: (N, K), traced with `rays` rays from each point. unshadowed: (N, K).
         network: from `weights.load_hybrid`.
     Returns:
         (N, K).
     """
-    even = np.ascontiguousarray(unshadowed.T[1:], dtype=np.float32) / np.float32(FULL)
-    now = np.array(blocked.T, dtype=np.float32, order="C")  # by coefficient: what is beside in memory is alike
-    now[1:] -= now[0] * even
-    step = _step(len(blocked))
-    for layers in network:
+    terms = blocked.shape[1]
+    even = unshadowed[:, 1:] / np.float32(FULL)
+    now = np.ones((len(blocked), terms + 1), np.float32)  # the last counts, in sums over neighbours
+    now[:, :terms] = blocked
+    now[:, 1:terms] -= now[:, :1] * even
+    known = np.concatenate([places.T, normals.T], dtype=np.float32)
+    for order, layers in zip(orders, network, strict=True):
         out = now.copy()
-        seen = now[0] != 0
 
-        def part(start: int, layers: Sequence[Layer] = layers, now: NDArray = now, out: NDArray = out,
-                 seen: NDArray = seen) -> None:
-            _pass(cloud, now, out, seen, start, min(start + step, now.shape[1]), rays, layers)
+        def part(rows: NDArray, size: int, now: NDArray = now, out: NDArray = out, layers: Sequence[Layer] = layers
+                 ) -> None:
+            values = now.take(rows, 0).reshape(-1, size, terms + 1)
+            seen = values[..., 0].any(1)
+            if not seen.any():
+                return
+            rows = rows.reshape(-1, size)
+            if not seen.all():
+                rows, values = rows[seen], values[seen]
+            here = known.take(rows, 1)
+            out[rows.ravel(), :terms] = mixed(here[:3], here[3:], values, rays, layers).reshape(-1, terms)
 
-        list(pool.map(part, range(0, now.shape[1], step)))
+        runs = blocks(order)
+        list(pool.map(part, *zip(*runs, strict=True)) if runs else ())
         now = out
-    now[1:] += now[0] * even
-    return np.ascontiguousarray(now.T)
+    found = now[:, :terms].copy()
+    found[:, 1:] += found[:, :1] * even
+    return found
 
 
-def _step(count: int) -> int:
-    """Points at a time, of so many in all: small meshes give work to all threads, too."""
-    return min(max(count // 4 + 1, 512), _MOST_POINTS)
+def blocks(order: NDArray) -> list[tuple[NDArray, int]]:
+    """Runs of an order (N,) with the size of the blocks in each: of SIZE, and what is left over at its end."""
+    whole = len(order) - len(order) % SIZE
+    step = SIZE * int(np.clip(len(order) // (4 * SIZE) + 1, *_BLOCKS))  # small meshes give work to all threads, too
+    runs = [(order[start:min(start + step, whole)], SIZE) for start in range(0, whole, step)]
+    return runs + ([(order[whole:], len(order) - whole)] if whole < len(order) else [])
 
 
-def _pairs(links: Neighbours, start: int, stop: int) -> tuple[NDArray, NDArray, slice]:
-    """The pairs (point, other) of points start..stop, and which of all they are."""
-    edges = slice(int(links.start[start]), int(links.start[stop]))
-    point = np.repeat(np.arange(start, stop, dtype=np.int32), np.diff(links.start[start:stop + 1]))
-    return point, links.points[edges], edges
-
-
-def _pass(cloud: Cloud, now: NDArray[np.float32], out: NDArray[np.float32], seen: NDArray[np.bool_], start: int,
-          stop: int, rays: int, layers: Sequence[Layer]) -> None:
-    """One pass for points start..stop: `now` to `out` (K, N)."""
-    point, other, edges = _pairs(cloud.links, start, stop)
-    shape = cloud.shape[:, edges]
-    some = np.flatnonzero(seen[point] | seen[other])
-    if not len(some):
-        return
-    if len(some) < len(point):
-        point, other, shape = point[some], other[some], shape[:, some]
-    theirs = [row.take(other) for row in now]
-    mine = [row.take(point) for row in now[:4]]
-    bands = sh.order_of(len(now))
-    weight = weights_of(features(shape, mine, theirs, rays), layers, rays, bands)
-    begins = np.flatnonzero(np.concatenate([[True], point[1:] != point[:-1]]))
-    rows = point[begins]
-    for band in range(bands):
-        total = 1 + np.add.reduceat(weight[band], begins)
-        for k in range(band * band, (band + 1) ** 2):
-            theirs[k] *= weight[band]
-            out[k, rows] = (now[k].take(rows) + np.add.reduceat(theirs[k], begins)) / total
-
-
-def pair_shape(points: NDArray[np.float32], normals: NDArray[np.float32], point: NDArray, other: NDArray
-               ) -> NDArray[np.float32]:
-    """(4, L) of pairs of points: cosine of their normals, height of each over the other's plane, distance (log).
+def mixed(places: NDArray[np.float32], normals: NDArray[np.float32], values: NDArray[np.float32], rays: int,
+          layers: Sequence[Layer]) -> NDArray[np.float32]:
+    """One pass of b blocks of n points.
 
     Args:
-        points, normals: (3, N), the points `normalised`. point, other: (L,) indices.
+        places, normals: (3, b, n): NumPy is quick along long last axes.
+        values: (b, n, K + 1), of which the last is 1. rays: from each point.
+    Returns:
+        (b, n, K).
     """
-    away = [axis.take(other) - axis.take(point) for axis in points]
-    one, two = [axis.take(point) for axis in normals], [axis.take(other) for axis in normals]
-    square = _dot(away, away) + np.float32(1e-14)
-    inverse = 1 / np.sqrt(square)
-    return np.stack([_dot(one, two), _dot(one, away) * inverse, -_dot(two, away) * inverse, 0.25 * np.log(square)])
-
-
-def features(shape: NDArray[np.float32], mine: Sequence[NDArray], theirs: Sequence[NDArray], rays: int
-             ) -> NDArray[np.float32]:
-    """(FEATURES + 1, L) of pairs of points, none of which changes when everything is turned, moved or scaled.
-
-    Args:
-        shape: (4, L) from `pair_shape`. mine, theirs: K arrays (L,), their blocked parts, of which four count.
-        rays: from each point.
-    """
-    out = np.empty((FEATURES + 1, shape.shape[1]), np.float32)
-    out[:4] = shape
-    out[4] = 0.5 * np.log(rays)
-    one = mine[0] - theirs[0]
-    one *= one
-    more = [a - b for a, b in zip(mine[1:4], theirs[1:4], strict=True)]
-    for row, values in ((5, one), (6, _dot(more, more))):
-        values += np.float32(_TINY)
-        np.log(values, out=out[row])
-        out[row] *= 0.25
-    np.multiply(mine[0], 4, out=out[7])  # to about 0..1
-    np.multiply(theirs[0], 4, out=out[8])
-    out[9] = 1  # for the biases
+    count, points = places.shape[1:]
+    terms = values.shape[2] - 1
+    bands = sh.order_of(terms)
+    away = places - (np.einsum("xbn->xb", places) * np.float32(1 / points))[..., None]
+    squares = _dot(away, away)
+    size = np.sqrt(np.einsum("bn->b", squares) * np.float32(1 / points)) + np.float32(1e-9)
+    away /= size[:, None]
+    squares /= np.square(size)[:, None]
+    seen = values[..., :4].transpose(2, 0, 1).copy()
+    context = _context(size, normals, seen, rays)
+    distance, plane, facing, first, second, *own = perceptron(context, layers, bands).T[..., None]
+    # log w, but for the tangent planes: what depends on one point only, and products of two
+    seen[0] *= np.sqrt(first)
+    seen[1:] *= np.sqrt(second)
+    alone = distance * squares
+    alone += _dot(seen, seen)
+    left, right = np.empty((2, 12, count, points), np.float32)
+    np.multiply(away, 2 * distance, out=left[:3])
+    np.multiply(normals, facing, out=left[3:6])
+    np.multiply(seen, 2, out=left[6:10])
+    np.subtract(-facing, alone, out=left[10])
+    left[11] = right[10] = 1
+    right[:3], right[3:6], right[6:10] = away, normals, seen
+    np.negative(alone, out=right[11])
+    weight = left.transpose(1, 2, 0) @ right.transpose(1, 0, 2)
+    # how far the other lies off one's tangent plane
+    np.multiply(normals, np.sqrt(plane), out=left[:3])
+    np.negative(_dot(left[:3], away), out=left[3])
+    right[3] = 1
+    height = left[:4].transpose(1, 2, 0) @ right[:4].transpose(1, 0, 2)
+    weight -= np.square(height, out=height)
+    sums = np.exp(weight, out=weight) @ values
+    mine = np.repeat(np.concatenate(own, 1), [2 * band + 1 for band in range(bands)], 1)[:, None]
+    mine *= np.float32((HALF + rays) / HALF)
+    out = mine * values[..., :terms]
+    out += sums[..., :terms]
+    out /= mine + sums[..., terms:]
     return out
 
 
-def weights_of(values: NDArray[np.float32], layers: Sequence[Layer], rays: int, bands: int) -> NDArray[np.float32]:
-    """(bands, L) from `features`."""
-    for number, layer in enumerate(layers):
-        matrix = np.concatenate([layer.weight, layer.bias[None]]).T
-        last = number + 1 == len(layers)
-        if last:
-            matrix = matrix[:bands]
-        out = np.empty((len(matrix) + (not last), values.shape[1]), np.float32)
-        out[len(matrix):] = 1
-        for start in range(0, values.shape[1], _BLAS_COLUMNS):
-            here = slice(start, start + _BLAS_COLUMNS)
-            np.matmul(matrix, values[:, here], out=out[:len(matrix), here])
-        values = out
-        if not last:
-            np.maximum(values, 0, out=values)
-    np.clip(values, LEAST, MOST, out=values)
-    np.exp(values, out=values)
-    values *= np.float32(HALF / (HALF + rays))
-    return values
-
-
-def _dot(one: Sequence[NDArray], two: Sequence[NDArray]) -> NDArray:
-    """Of vectors given by their three components."""
+def _dot(one: NDArray[np.float32], two: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Of vectors (k, ...)."""
     out = one[0] * two[0]
-    out += one[1] * two[1]
-    out += one[2] * two[2]
+    for a, b in zip(one[1:], two[1:], strict=True):
+        out += a * b
     return out
+
+
+def _context(size: NDArray[np.float32], normals: NDArray[np.float32], seen: NDArray[np.float32], rays: int
+             ) -> NDArray[np.float32]:
+    """(b, CONTEXT) of blocks: their size (b,), how their points face (3, b, n), what they see (4, b, n)."""
+    points = seen.shape[2]
+    share = np.float32(1 / points)
+    mean = np.einsum("kbn->kb", seen) * share
+    apart = seen - mean[..., None]
+    varying = np.einsum("kbn,kbn->kb", apart, apart) * share
+    out = np.empty((len(size), CONTEXT), np.float32)
+    out[:, 0] = 0.5 * np.log(size)
+    out[:, 1] = 2 * np.square(np.einsum("xbn->xb", normals) * share).sum(0)
+    out[:, 2] = 4 * mean[0]
+    out[:, 3] = 0.5 * np.log(varying[0] + np.float32(TINY))
+    out[:, 4] = 0.5 * np.log(varying[1:].sum(0) + np.float32(TINY))
+    out[:, 5] = 0.5 * np.log(rays)
+    out[:, 6] = np.log(points) - 3
+    return out
+
+
+def perceptron(seen: NDArray[np.float32], layers: Sequence[Layer], bands: int) -> NDArray[np.float32]:
+    """(b, FORMS + bands) from `_context`: the coefficients of the form, and s of each band."""
+    for layer in layers[:-1]:
+        seen = np.maximum(seen @ layer.weight + layer.bias, 0)
+    last = layers[-1]
+    out = seen @ last.weight[:, :FORMS + bands] + last.bias[:FORMS + bands]
+    return np.exp(np.clip(out, LEAST, MOST))

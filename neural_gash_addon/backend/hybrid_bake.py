@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import spherical_harmonics as sh
-from .estimator import MAX_RAYS, BlockedEstimator, morton_order
+from .estimator import MAX_RAYS, BlockedEstimator
 from .geometry import TriangleMesh
-from .hybrid import Cloud, Network, filtered
-from .neighbours import neighbours
+from .hybrid import Network, curves, filtered, placed
 from .progress import scaled
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
@@ -44,13 +43,11 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     if scene is None:
         scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
     lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
-    lit = lit[morton_order(mesh.points[lit])] if len(lit) else lit
     last = MAX_RAYS if rays is None else rays
     unshadowed = np.empty((len(mesh.points), sh.coefficient_count(order)), np.float32)
     with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
-        for _ in pool.map(lambda rows: np.copyto(unshadowed[rows], sh.cosine_lobe(mesh.normals[rows], order)),
-                          [slice(start, start + _ROWS) for start in range(0, len(unshadowed), _ROWS)]):
-            pass
+        list(pool.map(lambda rows: np.copyto(unshadowed[rows], sh.cosine_lobe(mesh.normals[rows], order)),
+                      [slice(start, start + _ROWS) for start in range(0, len(unshadowed), _ROWS)]))
         work = _Work(mesh, scene, order, seed, last, lit, pool, threads, network, unshadowed)
         error, used, left = None, 0, 1.0
         blocked = np.zeros_like(unshadowed)
@@ -78,7 +75,14 @@ class _Work:
         self._estimator = BlockedEstimator(mesh, scene, order, seed, rays)
         self._mesh, self._scene, self._order, self._seed = mesh, scene, order, seed
         self._unshadowed = unshadowed
-        self._lit, self._pool, self._threads, self._network = lit, pool, threads, network
+        self._pool, self._threads, self._network = pool, threads, network
+        self._placed, self._curves = (np.zeros((0, 3)), np.zeros((0, 3))), [lit, lit]
+        if len(lit):
+            places, normals = placed(mesh.points[lit], mesh.normals[lit])
+            first, second = curves(places)
+            lit, self._placed = lit[first], (places[first], normals[first])  # points are in the first curve's order now
+            self._curves = [np.arange(len(lit)), np.argsort(first)[second]]
+        self._lit = lit
         self._sums = np.zeros((len(lit), sh.coefficient_count(order)))
         self._sample_size = min(len(lit), max(_SAMPLE, min(len(lit) // 256, _MOST_SAMPLE)))
         self._sample_rays = int(np.clip(_SAMPLE_TIMES * rays, _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS))
@@ -87,12 +91,13 @@ class _Work:
     def trace(self, start: int, stop: int) -> Generator[float, None, NDArray[np.float32]]:
         """The blocked part (N, K) of all points, from directions start..stop in addition to those before."""
         yield from self._estimator.trace(self._pool, self._threads, self._lit, start, stop, self._sums)
-        local = self._estimator.means(self._lit, self._sums, 0, stop)
-        blocked = np.zeros((len(self._mesh.points), local.shape[1]), np.float32)
-        blocked[self._lit] = self._estimator.turned(self._pool, self._lit, local)
-        links = neighbours(self._mesh, blocked[:, 0] != 0)
-        cloud = Cloud.of(self._mesh.points, self._mesh.normals, links, self._pool)
-        return filtered(cloud, blocked, self._unshadowed, stop, self._network, self._pool)
+        lit = self._lit
+        local = self._estimator.means(lit, self._sums, 0, stop)
+        traced = self._estimator.turned(self._pool, lit, local)
+        blocked = np.zeros_like(self._unshadowed)
+        blocked[lit] = filtered(*self._placed, self._curves, traced, self._unshadowed[lit], stop, self._network,
+                                self._pool)
+        return blocked
 
     def sample(self) -> tuple[NDArray, NDArray, NDArray]:
         """Some points (n,), and two independent traces (n, K) of their blocked part; on the calling thread."""

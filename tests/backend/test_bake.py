@@ -130,6 +130,20 @@ def test_points_without_a_normal_get_nothing():
     assert not found[-1].any() and found[0].any() and np.isfinite(found).all()
 
 
+@pytest.mark.parametrize("method", list(methods.METHODS))
+def test_normals_that_are_no_numbers_count_as_none(method):
+    if "PyTorch" in methods.METHODS[method].label:
+        pytest.importorskip("torch", reason="the paper's networks need torch")
+    positions, triangles = shapes.torus()
+    normals = TriangleMesh.from_triangles(positions, triangles).normals[triangles.ravel()]
+    normals[triangles.ravel() == 3] = np.nan
+    faces = np.repeat(np.arange(len(triangles)), 3)
+    mesh = TriangleMesh.from_corners(positions, triangles, triangles.ravel(), normals, faces)
+    found = bake(mesh, method=method, rays=4 if methods.METHODS[method].traces else None).coefficients
+    assert np.isfinite(found).all()
+    assert not found[3].any() and found[4, 0] > 0
+
+
 @pytest.mark.parametrize("broken", ["degenerate", "duplicate", "flipped"])
 def test_broken_faces_bake_to_finite_numbers(broken):
     positions, triangles = shapes.cube(subdivisions=1)

@@ -9,7 +9,6 @@ from neural_gash_addon.backend import hybrid, methods, metrics, texture, weights
 from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.errors import UserError
 from neural_gash_addon.backend.geometry import TriangleMesh
-from neural_gash_addon.backend.neighbours import Neighbours, neighbours
 
 from . import shapes
 from .test_texture import lookup, surface
@@ -46,49 +45,68 @@ def bake(mesh, method="hybrid", rays=8, order=3, **settings):
     return methods.run(methods.bake(mesh, method, order, rays=rays, **settings))
 
 
-def slowly(mesh, links, blocked, rays, network):
-    """`hybrid.filtered`, point by point and neighbour by neighbour, as its docstring says."""
-    lobe = sh.cosine_lobe(mesh.normals, sh.order_of(blocked.shape[1]))
+def run(points, normals, blocked, unshadowed, rays=4, network=None, threads=2):
+    """`hybrid.filtered` of points as they are."""
+    places, normals = hybrid.placed(points, normals)
+    with ThreadPoolExecutor(threads) as pool:
+        return hybrid.filtered(places, normals, hybrid.curves(places), blocked.astype(np.float32),
+                               unshadowed.astype(np.float32), rays, network or weights.load_hybrid(), pool)
+
+
+def slowly(points, normals, blocked, unshadowed, rays, network):
+    """`hybrid.filtered`, block by block and pair by pair, as its docstring says."""
     order = sh.order_of(blocked.shape[1])
-    extent = 2 * np.linalg.norm(mesh.points - mesh.points.mean(0), axis=1).max()
+    places, normals = hybrid.placed(points, normals)
     now = blocked.astype(float).copy()
-    now[:, 1:] -= now[:, :1] * lobe[:, 1:] / lobe[:, :1]
-    for layers in network:
+    now[:, 1:] -= now[:, :1] * unshadowed[:, 1:] / unshadowed[:, :1]
+    for curve, layers in zip(hybrid.curves(places), network, strict=True):
         out = now.copy()
-        for i in range(len(now)):
-            sums, totals = now[i].copy(), np.ones(order)
-            for j in links.points[links.start[i]:links.start[i + 1]]:
-                if now[i, 0] == 0 and now[j, 0] == 0:
-                    continue
-                away = (mesh.points[j] - mesh.points[i]) / extent
-                d = np.linalg.norm(away)
-                ni, nj = mesh.normals[i], mesh.normals[j]
-                gap = now[i, :4] - now[j, :4]
-                x = np.array([ni @ nj, ni @ away / d, -nj @ away / d, 0.5 * np.log(d), 0.5 * np.log(rays),
-                              0.25 * np.log(gap[0] ** 2 + 1e-5), 0.25 * np.log((gap[1:] ** 2).sum() + 1e-5),
-                              4 * now[i, 0], 4 * now[j, 0]])
-                for number, layer in enumerate(layers):
-                    x = x @ layer.weight + layer.bias
-                    x = np.maximum(x, 0) if number + 1 < len(layers) else x
-                w = np.exp(np.clip(x, -12, 4))[:order] * 64 / (64 + rays)
-                totals += w
-                sums += np.repeat(w, 2 * np.arange(order) + 1) * now[j]
-            out[i] = sums / np.repeat(totals, 2 * np.arange(order) + 1)
+        for start in range(0, len(curve), hybrid.SIZE):
+            block = curve[start:start + hybrid.SIZE]
+            if not now[block, 0].any():
+                continue
+            centre = places[block].mean(0)
+            size = np.sqrt(np.mean([np.sum((places[i] - centre) ** 2) for i in block]))
+            x = np.array([0.5 * np.log(size), 2 * np.sum(normals[block].mean(0) ** 2), 4 * now[block, 0].mean(),
+                          0.5 * np.log(now[block, 0].var() + 1e-6), 0.5 * np.log(now[block, 1:4].var(0).sum() + 1e-6),
+                          0.5 * np.log(rays), np.log(len(block)) - 3])
+            for number, layer in enumerate(layers):
+                x = x @ layer.weight + layer.bias
+                x = np.maximum(x, 0) if number + 1 < len(layers) else x
+            distance, plane, facing, first, second, *own = np.exp(np.clip(x, -6, 12))[:5 + order]
+            own = np.repeat(own, 2 * np.arange(order) + 1) * (64 + rays) / 64
+            for i in block:
+                sums, total = own * now[i], own.copy()
+                for j in block:
+                    away, gap = (places[j] - places[i]) / size, now[i, :4] - now[j, :4]
+                    form = (distance * away @ away + plane * (normals[i] @ away) ** 2
+                            + facing * (1 - normals[i] @ normals[j]) + first * gap[0] ** 2 + second * gap[1:] @ gap[1:])
+                    sums, total = sums + np.exp(-form) * now[j], total + np.exp(-form)
+                out[i] = sums / total
         now = out
-    now[:, 1:] += now[:, :1] * lobe[:, 1:] / lobe[:, :1]
+    now[:, 1:] += now[:, :1] * unshadowed[:, 1:] / unshadowed[:, :1]
     return now
 
 
 def test_equals_its_slow_twin():
-    mesh = TriangleMesh.from_triangles(*shapes.torus())
-    links, lobe = neighbours(mesh), sh.cosine_lobe(mesh.normals, 3)
-    blocked = (lobe - bake(mesh, "embree", 4).coefficients).astype(np.float32)
-    network = weights.load_hybrid()
-    with ThreadPoolExecutor(2) as pool:
-        cloud = hybrid.Cloud.of(mesh.points, mesh.normals, links, pool)
-        found = hybrid.filtered(cloud, blocked, lobe.astype(np.float32), 4, network, pool)
-    np.testing.assert_allclose(found, slowly(mesh, links, blocked, 4, network), atol=2e-5)
+    mesh = TriangleMesh.from_triangles(*shapes.torus(sections=20))
+    lobe = sh.cosine_lobe(mesh.normals, 3)
+    blocked = lobe - bake(mesh, "embree", 4).coefficients
+    assert len(blocked) % hybrid.SIZE  # there is a rest
+    found = run(mesh.points, mesh.normals, blocked, lobe)
+    np.testing.assert_allclose(found, slowly(mesh.points, mesh.normals, blocked, lobe, 4, weights.load_hybrid()),
+                               atol=1e-4)
     assert np.abs(found - blocked).max() > 0.01
+
+
+def test_every_point_is_in_one_block_and_blocks_are_compact():
+    mesh = knot()
+    places, _ = hybrid.placed(mesh.points, mesh.normals)
+    for curve in hybrid.curves(places):
+        rows = np.concatenate([rows for rows, _ in hybrid.blocks(curve)])
+        assert np.array_equal(np.sort(rows), np.arange(len(places)))
+        inside = places[curve[:len(curve) // hybrid.SIZE * hybrid.SIZE].reshape(-1, hybrid.SIZE)]
+        assert np.median(np.ptp(inside, axis=1).max(1)) < 0.25  # all of it: 1 across
 
 
 @pytest.mark.parametrize(("rays", "factor"), [(2, 0.35), (8, 0.4), (32, 0.6)])
@@ -111,16 +129,11 @@ def test_turning_the_mesh_turns_the_answer(case):
     mesh, _, _ = case
     q, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
     q *= np.sign(np.linalg.det(q))
-    links, lobe = neighbours(mesh), sh.cosine_lobe(mesh.normals, 4)
+    lobe = sh.cosine_lobe(mesh.normals, 4)
     blocked = lobe - bake(mesh, "embree", 4, 4).coefficients
-    network = weights.load_hybrid()
-    with ThreadPoolExecutor(2) as pool:
-        def run(points, normals, values, unshadowed):
-            cloud = hybrid.Cloud.of(points, normals, links, pool)
-            return hybrid.filtered(cloud, values.astype(np.float32), unshadowed.astype(np.float32), 4, network, pool)
-        straight = run(mesh.points, mesh.normals, blocked, lobe)
-        turned = run(5 * mesh.points @ q.T + 100, mesh.normals @ q.T, _each_turned(blocked, q),
-                     sh.cosine_lobe(mesh.normals @ q.T, 4))
+    straight = run(mesh.points, mesh.normals, blocked, lobe)
+    turned = run(5 * mesh.points @ q.T + 100, mesh.normals @ q.T, _each_turned(blocked, q),
+                 sh.cosine_lobe(mesh.normals @ q.T, 4))
     np.testing.assert_allclose(turned, _each_turned(straight, q), atol=1e-4)
 
 
@@ -141,18 +154,13 @@ def test_threads_and_the_order_of_points_do_not_matter(case):
     mesh, _, _ = case
     one, two = (bake(mesh, rays=4, threads=t).coefficients for t in (1, 2))
     np.testing.assert_allclose(one, two, atol=1e-5)
-    links, lobe = neighbours(mesh), sh.cosine_lobe(mesh.normals, 3).astype(np.float32)
+    bent = mesh.positions + 0.1 * mesh.positions[:, :1] ** 2  # no two of its points are equally far out
+    mesh = TriangleMesh.from_triangles(bent, mesh.triangles)
+    lobe = sh.cosine_lobe(mesh.normals, 3)
     blocked = lobe - bake(mesh, "embree", 4).coefficients
     shuffle = np.random.default_rng(0).permutation(len(mesh.points))
-    place = np.argsort(shuffle)
-    other = TriangleMesh.from_triangles(mesh.positions[shuffle], place[mesh.triangles])
-    network = weights.load_hybrid()
-    with ThreadPoolExecutor(1) as pool:
-        def run(m, chain, values, unshadowed):
-            cloud = hybrid.Cloud.of(m.points, m.normals, chain, pool)
-            return hybrid.filtered(cloud, values, unshadowed, 4, network, pool)
-        first = run(mesh, links, blocked, lobe)
-        second = run(other, neighbours(other), blocked[shuffle], lobe[shuffle])
+    first = run(mesh.points, mesh.normals, blocked, lobe)
+    second = run(mesh.points[shuffle], mesh.normals[shuffle], blocked[shuffle], lobe[shuffle], threads=1)
     np.testing.assert_allclose(second, first[shuffle], atol=1e-5)
 
 
@@ -178,22 +186,15 @@ def test_texels_learn_from_the_grid():
     assert error["hybrid"] < 0.6 * error["embree"]
 
 
-def test_split_normals_learn_within_their_faces():
-    mesh = TriangleMesh.from_triangles(*shapes.torus(), smooth=False)
+def test_split_normals_learn_from_their_own_side():
+    """Flat shaded: where four faces meet there are four points in one place; each goes on facing as it does."""
+    smooth = knot()
+    mesh = TriangleMesh.from_triangles(smooth.positions, smooth.triangles, smooth=False)
     assert mesh.domain == "CORNER"
-    links = neighbours(mesh)
-    point = np.repeat(np.arange(len(mesh.points)), np.diff(links.start))
-    assert len(links.points) and (links.points != point).all()
-    assert (np.einsum("nx,nx->n", mesh.normals[point], mesh.normals[links.points]) > 0.99).all()
-    assert np.isfinite(bake(mesh, rays=2).coefficients).all()
-
-
-def test_neighbours_are_the_edges_of_the_mesh():
-    positions, triangles = shapes.sphere()
-    links = neighbours(TriangleMesh.from_triangles(positions, triangles))
-    for vertex in (0, 17, len(positions) - 1):
-        sides = triangles[(triangles == vertex).any(1)]
-        assert set(links.points[links.start[vertex]:links.start[vertex + 1]]) == set(sides.ravel()) - {vertex}
+    truth = bake(mesh, "embree", 1024, seed=5).coefficients
+    unshadowed = sh.cosine_lobe(mesh.normals, 3)
+    plain, better = (metrics.srr(bake(mesh, m, 4).coefficients, truth, unshadowed) for m in ("embree", "hybrid"))
+    assert better < 0.5 * plain
 
 
 @pytest.mark.parametrize("positions", [
@@ -207,14 +208,9 @@ def test_odd_meshes_give_finite_answers(positions):
 
 
 def test_points_in_one_place_give_finite_answers():
-    network = weights.load_hybrid()
     same, up = np.zeros((3, 3)), np.tile([0.0, 0.0, 1.0], (3, 1))
-    links = Neighbours(np.array([0, 2, 4, 6]), np.array([1, 2, 0, 2, 0, 1], np.int32))
-    lobe = sh.cosine_lobe(up, 3).astype(np.float32)
-    with ThreadPoolExecutor(1) as pool:
-        found = hybrid.filtered(hybrid.Cloud.of(same, up, links, pool), lobe * [[0.1], [0.5], [0.9]], lobe, 2, network,
-                                pool)
-    assert np.isfinite(found).all()
+    lobe = sh.cosine_lobe(up, 3)
+    assert np.isfinite(run(same, up, lobe * [[0.1], [0.5], [0.9]], lobe, rays=2)).all()
 
 
 @pytest.mark.parametrize("harm", ["missing", "cut", "altered", "no checksum"])
@@ -246,14 +242,10 @@ def test_equals_the_torch_module_that_trained_it(case):
             for linear, layer in zip((m for m in module if hasattr(m, "weight")), layers, strict=True):
                 linear.weight.copy_(torch.from_numpy(layer.weight.T.copy()))
                 linear.bias.copy_(torch.from_numpy(layer.bias.copy()))
-        links = neighbours(mesh)
         blocked = (unshadowed - bake(mesh, "embree", 4).coefficients).astype(np.float32)
-        points = hybrid.normalised(mesh.points).astype(np.float32)
-        point = np.repeat(np.arange(len(points)), np.diff(links.start))
-        expected = model(*(torch.from_numpy(np.ascontiguousarray(a)) for a in (
-            points, mesh.normals.astype(np.float32), point, links.points.astype(np.int64), blocked,
-            unshadowed.astype(np.float32))), 4)[-1].numpy()
-    with ThreadPoolExecutor(2) as pool:
-        cloud = hybrid.Cloud.of(mesh.points, mesh.normals, links, pool)
-        found = hybrid.filtered(cloud, blocked, unshadowed.astype(np.float32), 4, model.network(), pool)
+        places, normals = hybrid.placed(mesh.points, mesh.normals)
+        expected = model(*(torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in (places, normals)),
+                         [torch.from_numpy(curve) for curve in hybrid.curves(places)], torch.from_numpy(blocked),
+                         torch.from_numpy(unshadowed.astype(np.float32)), 4)[-1].numpy()
+    found = run(mesh.points, mesh.normals, blocked, unshadowed, network=model.network())
     np.testing.assert_allclose(found, expected, atol=1e-5)
