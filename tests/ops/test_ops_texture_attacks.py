@@ -254,3 +254,10 @@ def test_a_folder_without_a_beginning_is_refused(make, texture, refused, tmp_pat
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     texture.texture_folder = "maps"
     assert "begin it with //" in refused(bpy.ops.neural_gash.bake)
+
+
+def test_faces_that_cannot_be_unwrapped_are_said(make, texture, capfd):
+    texture.method = "analytic"
+    make([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (2, 0, 0), (2, 1, 0)], [(0, 1, 2, 3), (1, 2, 4, 5)], "Bow Tie")
+    assert bpy.ops.neural_gash.bake() == {"FINISHED"}
+    assert "1 of the faces of 'Bow Tie' could not be unwrapped" in capfd.readouterr().out
