@@ -21,7 +21,7 @@ _ANGLES = 24     # in a right angle, at which a chart's box is measured first,
 _HALVINGS = 6    # and then between the two beside the best, to a sixteenth of a degree
 _CLEARLY = 1e-6  # smaller has to be a box that is preferred to an upright one
 _STEP = 0.985    # of the texels a metre, from one try to the next
-_THINNEST = 0.1  # of the texels a metre that charts without any room between them would have
+_THINNEST = 0.1  # of the texels a metre that charts would have if they needed no room between them
 
 
 def boxed(local: Array, charts: NDArray[np.int64]) -> Generator[float, None, tuple[Array, Array]]:
@@ -94,11 +94,11 @@ def arranged(boxes: Array, area: float, *, side: int | None, density: float | No
         scale, least = density or 1.0, 0.0
         room = max((a * scale * scale + b * scale + c) ** 0.5, widest * scale + gap)
     else:
-        least = _THINNEST * side / max(area ** 0.5, 1e-300)
         room = side + 1.0  # the last box of a row needs no texel after it
         left = room * room - c
         scale = 2 * left / max(b + max(b * b + 4 * a * left, 0.0) ** 0.5, 1e-300) * (1 - 1e-9)
-        scale = min(scale, (room - gap) / max(widest, 1e-300))
+        longest = (room - gap) / max(widest, 1e-300)
+        scale, least = min(scale, longest), _THINNEST * min(side / max(area ** 0.5, 1e-300), longest)
     tries = 0
     while scale > least:
         yield 1 - _STEP ** tries

@@ -134,6 +134,15 @@ def test_boxes_are_apart_and_as_small_as_turning_makes_them():
         assert grown == pytest.approx(side, rel=0.03)
 
 
+@pytest.mark.parametrize("width", [1e-2, 1e-7])
+def test_long_and_thin_meshes_have_room(width):
+    """A skirting board, and a needle."""
+    strip = np.array([[0., 0, 0], [10, 0, 0], [10, width, 0], [0, width, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    found = atlas(surface(strip), 256)
+    assert np.ptp(found.uv, axis=0).max() > 0.95
+    assert len(methods.run(texture.bake(surface(strip), "analytic", 2, side=64)).texels)
+
+
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_atlas_does_not_depend_on_scale(scale):
     positions, triangles = shapes.torus()
