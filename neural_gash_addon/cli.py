@@ -24,7 +24,17 @@ from .backend.lobes import GGX, PHONG
 from .backend.transfer import Transfer
 from .ops.batch import finish_batch, prepare_batch
 from .ops.job import summary
-from .properties import COLLECTION, FIT, RAYS, RESOLUTION, TEXTURE, TOLERANCE, VERTICES, NeuralGashSettings
+from .properties import (
+    COLLECTION,
+    DENSITY,
+    FIT,
+    RAYS,
+    RESOLUTION,
+    TEXTURE,
+    TOLERANCE,
+    VERTICES,
+    NeuralGashSettings,
+)
 from .scene import lighting
 from .scene.attributes import has_bake, read_record
 from .scene.gloss import can_gloss
@@ -66,8 +76,9 @@ def _parser() -> argparse.ArgumentParser:
                       help="what casts shadows on the object (self)")
     bake.add_argument("--bounces", type=int, default=0, help="how often light may bounce between surfaces, at most (0)")
     bake.add_argument("--texture", type=_side, metavar="SIDE",
-                      help="bake to a texture of SIDE x SIDE texels instead; 'fit': as large as the tolerance "
-                           "needs (0.02 with --rays)")
+                      help="bake to a texture of SIDE x SIDE texels instead; '50/m': so many texels a metre; 'fit': as "
+                           "large as the tolerance needs (0.02 with --rays)")
+    bake.add_argument("--padding", type=int, metavar="TEXELS", help="around each part of the UV map of --texture (2)")
     bake.add_argument("--share", action="store_true", help="one texture for all objects, with --texture")
     bake.add_argument("--uv-map", metavar="NAME", default="", help="of the mesh, for --texture; else one is made")
     bake.add_argument("--textures", metavar="FOLDER", type=Path, help="write the textures as .exr there, not into OUT")
@@ -96,10 +107,12 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _side(text: str) -> int | str:
-    """A number of texels, or 'fit'."""
+def _side(text: str) -> tuple[str, float]:
+    """What decides the size of a texture, and the number of texels that does."""
     try:
-        return text if text == "fit" else int(text)
+        if text == "fit":
+            return FIT, 0
+        return (DENSITY, float(text[:-2])) if text.endswith("/m") else (RESOLUTION, int(text))
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"'{text}' is neither a number of texels nor 'fit'") from error
 
@@ -133,8 +146,9 @@ def main(argv: Sequence[str]) -> int:
 
 def _bake(arguments: argparse.Namespace) -> tuple[list[dict], str]:
     """`bake`."""
-    if arguments.texture is None and (arguments.uv_map or arguments.textures or arguments.half or arguments.share):
-        raise UserError("--uv-map, --textures, --half and --share belong to a bake with --texture.")
+    if arguments.texture is None and (arguments.uv_map or arguments.textures or arguments.half or arguments.share
+                                      or arguments.padding is not None):
+        raise UserError("--uv-map, --textures, --padding, --half and --share belong to a bake with --texture.")
     if arguments.gloss and (arguments.texture is None or arguments.bounces):
         raise UserError("--gloss belongs to a bake with --texture and without --bounces.")
     if arguments.npz is not None and len(arguments.objects or ()) > 1:
@@ -161,9 +175,10 @@ def _bake(arguments: argparse.Namespace) -> tuple[list[dict], str]:
     _set(settings, "bounces", arguments.bounces)
     if arguments.texture is not None:
         settings.target = TEXTURE
-        settings.sizing = FIT if arguments.texture == "fit" else RESOLUTION
-        if settings.sizing == RESOLUTION:
-            _set(settings, "side", arguments.texture)
+        settings.sizing, size = arguments.texture
+        if settings.sizing != FIT:
+            _set(settings, "side" if settings.sizing == RESOLUTION else "texels_per_metre", size)
+        _set(settings, "padding", 2 if arguments.padding is None else arguments.padding)
         settings.share, settings.uv_map, settings.half = arguments.share, arguments.uv_map, arguments.half
         settings.texture_folder = str(arguments.textures.absolute()) if arguments.textures else ""
     else:

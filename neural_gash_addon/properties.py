@@ -80,7 +80,7 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
         description="Texels along a metre of the surface")
     padding: IntProperty(  # type: ignore[valid-type]
         name="Padding", default=2, min=1, max=64, subtype="PIXEL",
-        description="Texels between the parts of the UV map; more keeps them apart also from afar")
+        description="Texels around each part of the UV map; more keeps them apart also from afar")
     uv_map: StringProperty(  # type: ignore[valid-type]
         name="UV Map", default="",
         description="A UV map of the mesh to bake to, in which no faces overlap; leave empty to have one made")

@@ -13,7 +13,7 @@ from .geometry import Surface
 from .progress import scaled
 from .raster import CHECKED_SIDE, Layout, check_range
 from .resolution import MAX_FIT, Trial, fitting_density
-from .unwrap import Atlas, Charts, cut, lay_out, least_side
+from .unwrap import Atlas, Charts, cut, lay_out
 
 MIN_SIDE, MAX_SIDE = 16, 8192
 
@@ -28,6 +28,14 @@ class Part:
     name: str = ""              # to tell meshes apart in messages
 
 
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Where a mesh is in a texture."""
+
+    uv: NDArray        # (C, 2) of each face corner, 0 to 1
+    single_faces: int  # that lie alone in an atlas, as they cannot be charted with their neighbours
+
+
 def check_part(part: Part) -> None:
     """UserError for a mesh that no texture has room for, whatever else is in it."""
     if part.uv is not None:
@@ -39,7 +47,7 @@ def check_part(part: Part) -> None:
 
 
 def place(parts: Sequence[Part], *, side: int | None = None, texels_per_metre: float | None = None, padding: int = 2,
-          ) -> Generator[float, None, tuple[list[NDArray], int]]:
+          ) -> Generator[float, None, tuple[list[Placed], int]]:
     """UVs for meshes in one texture without overlaps, and its size.
 
     Args:
@@ -50,7 +58,7 @@ def place(parts: Sequence[Part], *, side: int | None = None, texels_per_metre: f
     Yields:
         Progress, 0 to 1.
     Returns:
-        (C, 2) UVs of each mesh's face corners, 0 to 1, and the side.
+        Where each mesh is, and the side.
     Raises:
         UserError: sizes out of range, UVs outside the texture or missing room, faces that overlap.
     """
@@ -64,7 +72,7 @@ def place(parts: Sequence[Part], *, side: int | None = None, texels_per_metre: f
         _check_overlaps(parts, uvs, min(side or CHECKED_SIDE, CHECKED_SIDE))
         for number, (trial, uv) in enumerate(zip(trials, uvs, strict=False)):
             side = max(side or 0, (yield from scaled(trial(uv), number / len(parts), 1 / len(parts))))
-        return uvs, side or 0
+        return [Placed(uv, 0) for uv in uvs], side or 0
     charts, scales = [], []
     for number, part in enumerate(parts):
         here, share = 0.8 * number / len(parts), 0.8 / len(parts)
@@ -77,28 +85,26 @@ def place(parts: Sequence[Part], *, side: int | None = None, texels_per_metre: f
     if trials:
         atlas = yield from scaled(_fitted(joined, padding), 0.8, 0.2)
     else:
-        if side is None:
-            _check_density(least_side(joined, texels_per_metre or 1.0), 0)  # xatlas dies of what memory cannot hold
         laying = lay_out(joined, side=side, texels_per_metre=texels_per_metre, padding=padding)
         atlas = yield from scaled(laying, 0.8, 0.2)
         if side is None:
-            _check_density(atlas.side, MIN_SIDE)
-    return np.split(atlas.uv, np.cumsum([c.corner_count for c in charts])[:-1]), atlas.side
+            _check_density(atlas.side)
+    uvs = np.split(atlas.uv, np.cumsum([c.corner_count for c in charts])[:-1])
+    alone = np.split(atlas.alone, np.cumsum([len(c.triangles) for c in charts])[:-1])
+    return [Placed(uv, len(np.unique(c.polygons[a]))) for uv, a, c in zip(uvs, alone, charts, strict=True)], atlas.side
 
 
 def _fitted(charts: Charts, padding: int) -> Generator[float, None, Atlas]:
     """Charts measured in texels, in a texture as large as that takes, within what an error may ask for."""
-    if least_side(charts, 1.0) > MAX_FIT:
-        return (yield from lay_out(charts, side=MAX_FIT, padding=padding))
     atlas = yield from lay_out(charts, side=None, texels_per_metre=1.0, padding=padding)
     if not MIN_SIDE <= atlas.side <= MAX_FIT:
         atlas = yield from lay_out(charts, side=MIN_SIDE if atlas.side < MIN_SIDE else MAX_FIT, padding=padding)
     return atlas
 
 
-def _check_density(side: float, least: int) -> None:
+def _check_density(side: int) -> None:
     """UserError unless a density gives a texture that can be baked."""
-    if not least <= side <= MAX_SIDE:
+    if not MIN_SIDE <= side <= MAX_SIDE:
         choose = "fewer" if side > MAX_SIDE else "more"
         raise UserError(f"At this density the texture would have {side:,.0f} texels a side, and {MIN_SIDE} to "
                         f"{MAX_SIDE} can be baked; choose {choose} texels per metre.")

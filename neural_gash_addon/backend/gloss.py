@@ -21,7 +21,7 @@ from .workers import default_threads
 Array = NDArray[np.float64]
 
 _ROWS = 256       # of one small matrix product: its operands stay in the second-level cache
-_LIT_ROWS = 2048  # small enough for BLAS to stay on one thread
+_LIT_ROWS = 1024  # small enough for BLAS to stay on one thread
 _BLOCK = 1 << 16  # points at a time, so that memory does not grow with their number
 
 
@@ -114,12 +114,10 @@ def lit_channels(transfer: NDArray[np.float32], light: NDArray, channels: int, o
     matrix[:, :3] = light
     products = np.pi * light_matrix(light, sh.order_of(coefficients)).transpose(1, 0, 2)
     matrix[:, 3:3 + 3 * coefficients] = products.reshape(coefficients, -1)
-    parts = np.ascontiguousarray(matrix.reshape(coefficients, len(out), channels).transpose(1, 0, 2))
 
     def block(start: int) -> None:
-        rows = transfer[start:start + _LIT_ROWS]  # stays in the cache for all images
-        for image, part in zip(out, parts, strict=True):
-            np.matmul(rows, part, out=image[start:start + _LIT_ROWS])
+        found = transfer[start:start + _LIT_ROWS] @ matrix  # stays in the cache while it is dealt out to the images
+        out[:, start:start + _LIT_ROWS] = found.reshape(len(found), len(out), channels).transpose(1, 0, 2)
 
     with ThreadPoolExecutor(default_threads()) as pool:
         list(pool.map(block, range(0, count, _LIT_ROWS)))

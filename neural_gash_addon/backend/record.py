@@ -42,6 +42,7 @@ class BakeRecord:
     target: str = "vertices"          # or 'texture'
     side: int = 0                     # texels a side of a texture
     uv_map: str = ""                  # whose coordinates the texture has
+    single_faces: int = 0             # that lie alone in it, as xatlas could not chart them with their neighbours
     bounces: int = 0                  # of diffuse interreflection that were computed
     colours: int = 1                  # transfer is (N, K), or (N, K, 3) where light bounced off colours
     basis: str = BASIS

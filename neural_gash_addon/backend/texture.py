@@ -99,7 +99,8 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
     """
     began = time.perf_counter()
     placing = place([Part(surface, uv)], side=side, texels_per_metre=texels_per_metre, padding=padding)
-    (uv,), side = yield from scaled(placing, 0, _LAYOUT_SHARE)
+    (placed,), side = yield from scaled(placing, 0, _LAYOUT_SHARE)
+    uv = placed.uv
     layout = Layout(uv[surface.corners], surface.triangles, side)
     digest = hashlib.blake2b(uv.tobytes(), digest_size=16).hexdigest()
     store = _Store(folder, f"{key} {side} {digest}") if folder is not None else None
@@ -131,7 +132,7 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
     if not texels:
         raise UserError("The UVs leave no face any room in the texture, so there is nothing to bake.")
     record = replace(_whole(records, [_energy(c) for c in coefficients]), seconds=time.perf_counter() - began,
-                     seed=seed, target="texture", side=side)
+                     seed=seed, target="texture", side=side, single_faces=placed.single_faces)
     return TextureTransfer(uv, texels, coefficients, inside, record)
 
 
@@ -160,7 +161,8 @@ def merged(transfers: Sequence[TextureTransfer]) -> TextureTransfer:
             for keep in [(owner[texels] == number) | (owner[texels] < 0)]]
     record = _whole([t.record for t in transfers], [sum(map(_energy, t.coefficients)) for t in transfers])
     record = replace(record, seconds=sum(t.record.seconds for t in transfers), fingerprint="", uv_map="",
-                     frame=IDENTITY, bounces=max(t.record.bounces for t in transfers))
+                     single_faces=sum(t.record.single_faces for t in transfers), frame=IDENTITY,
+                     bounces=max(t.record.bounces for t in transfers))
     return TextureTransfer(first.uv, [k[0] for k in kept], [k[1] for k in kept], [k[2] for k in kept], record)
 
 

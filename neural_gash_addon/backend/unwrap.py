@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """UVs of a mesh's own for a bake, by xatlas: every face has a place that no other face has.
 
-xatlas takes time that grows faster than its charts, rasters each chart at the size of the atlas
-even where that is not the last packing, and holds the interpreter's lock meanwhile. So the mesh is cut
-into pieces of neighbouring faces; xatlas charts each by itself, at a tiny resolution, and packs all
-charts together once the pieces are done. On 18,000 triangles that takes a fifth of the time at the
-default options, and a window gets its turn between the pieces.
+xatlas takes time that grows faster than its charts, rasters each chart at the size of the atlas, and
+holds the interpreter's lock meanwhile. So the mesh is cut into pieces of neighbouring faces; xatlas
+charts each by itself, at a tiny resolution, and `packing` places the charts of all. On 18,000 triangles
+that takes a fifth of the time at the default options, and a window gets its turn between the pieces.
 """
 from __future__ import annotations
 
@@ -18,15 +17,12 @@ from numpy.typing import NDArray
 from .errors import UserError
 from .estimator import morton_order
 from .geometry import Surface, unit
+from .packing import arranged, boxed
 from .progress import scaled
 from .raster import CHECKED_SIDE, Layout
 
 PIECE = 1000           # triangles that xatlas charts at a time: 40 ms at most
 _DRAFT_RESOLUTION = 16  # of a piece's own packing, which is thrown away
-_FILLED = 0.65         # of the texture, at the first try of packing
-_BESIDE = 1.5          # texels that a chart takes beside its area and padding, each way
-_SHRINK = 0.94         # of the texels a metre, from one try to the next
-_TRIES = 16
 _REPAIRS = 3           # times that faces which lie over each other are laid out anew, each alone
 _FLAT = 1e-10          # of a face's area that is left in UVs: less, and it has collapsed
 
@@ -41,25 +37,23 @@ class Charts:
     corners: NDArray[np.int32]        # (F, 3) face corners
     polygons: NDArray[np.int32]       # (F,)
     corner_count: int                 # C, of the mesh or of all together
-    pieces: list[NDArray[np.int64]]   # triangles whose charts were cut together
-    areas: NDArray[np.float64]        # of the charts, square metres
+    charts: NDArray[np.int64]         # (F,) number of each triangle's chart
     alone: NDArray[np.bool_]          # (F,) triangles of polygons that xatlas cannot chart
 
     @staticmethod
     def joined(parts: Sequence[Charts], scales: Sequence[float]) -> Charts:
         """The charts of several meshes, each as large as `scales` says, their corners counted on."""
-        vertices, faces, corners, polygons = (
+        vertices, corners, polygons, charts = (
             np.concatenate([[0], np.cumsum(counts)]) for counts in (
-                [len(p.positions) for p in parts], [len(p.triangles) for p in parts],
-                [p.corner_count for p in parts], [int(p.polygons.max()) + 1 for p in parts]))
+                [len(p.positions) for p in parts], [p.corner_count for p in parts],
+                [int(p.polygons.max()) + 1 for p in parts], [int(p.charts.max()) + 1 for p in parts]))
         return Charts(
             np.concatenate([p.local * scale for p, scale in zip(parts, scales, strict=True)]),
             np.concatenate([p.positions * scale for p, scale in zip(parts, scales, strict=True)]),
             np.concatenate([p.triangles + n for p, n in zip(parts, vertices, strict=False)]),
             np.concatenate([p.corners + n for p, n in zip(parts, corners, strict=False)]),
             np.concatenate([p.polygons + n for p, n in zip(parts, polygons, strict=False)]),
-            int(corners[-1]), [piece + n for p, n in zip(parts, faces, strict=False) for piece in p.pieces],
-            np.concatenate([p.areas * scale ** 2 for p, scale in zip(parts, scales, strict=True)]),
+            int(corners[-1]), np.concatenate([p.charts + n for p, n in zip(parts, charts, strict=False)]),
             np.concatenate([p.alone for p in parts]))
 
 
@@ -70,16 +64,7 @@ class Atlas:
     uv: NDArray[np.float64]  # (C, 2) of each face corner, 0 to 1
     side: int                # texels a side
     texels_per_metre: float
-    charts: int
-    single_faces: int        # faces that were laid out alone, as xatlas could not chart them
-
-
-def least_side(charts: Charts, texels_per_metre: float) -> float:
-    """Texels a side that no packing of the charts stays below: their area, and the longest edge as a diagonal."""
-    places = charts.positions[charts.triangles]
-    edges = places - np.roll(places, 1, 1)
-    area = 0.5 * float(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum())
-    return texels_per_metre * max(area ** 0.5, (0.5 * float(np.square(edges).sum(2).max(initial=0.0))) ** 0.5)
+    alone: NDArray[np.bool_]  # (F,) triangles of polygons that were laid out alone, as xatlas could not chart them
 
 
 def unwrap(surface: Surface, *, side: int | None, texels_per_metre: float | None = None, padding: int = 2,
@@ -102,15 +87,16 @@ def cut(surface: Surface) -> Generator[float, None, Charts]:
     xatlas = _xatlas()
     positions, triangles, corners = surface.positions, surface.triangles, surface.corners
     normals, polygons = surface.corner_normals, surface.polygons
-    local = np.zeros((len(triangles), 3, 2))
+    local, charts = np.zeros((len(triangles), 3, 2)), np.zeros(len(triangles), np.int64)
     pieces = _pieces(positions, triangles, polygons)
-    areas: list[float] = []
+    count = 0
     for number, piece in enumerate(pieces):
         local[piece], found = _chart(xatlas, positions, triangles[piece], normals[corners[piece]])
-        areas += found
+        charts[piece] = found + count
+        count += int(found.max()) + 1
         yield (number + 1) / len(pieces)
     alone = _torn(local, positions, triangles, corners, polygons)
-    return Charts(local, positions, triangles, corners, polygons, len(normals), pieces, np.array(areas), alone)
+    return Charts(local, positions, triangles, corners, polygons, len(normals), charts, alone)
 
 
 def lay_out(charts: Charts, *, side: int | None, texels_per_metre: float | None = None, padding: int = 2,
@@ -123,27 +109,28 @@ def lay_out(charts: Charts, *, side: int | None, texels_per_metre: float | None 
     Yields:
         Progress, 0 to 1.
     Raises:
-        UserError: xatlas is not installed, or the texture is too small for its charts.
+        UserError: the texture is too small for its charts.
     """
-    xatlas = _xatlas()
-    density = _density(charts.areas, side, padding) if side else texels_per_metre or 1.0
     triangles, polygons = charts.triangles, charts.polygons
     local, alone = charts.local.copy(), charts.alone.copy()
     uv = np.zeros((charts.corner_count, 2))
     for number in range(_REPAIRS):
-        groups = [kept for piece in charts.pieces if len(kept := piece[~alone[piece]])]
+        numbers = charts.charts
         if alone.any():
             local[alone] = _laid_flat(charts.positions[triangles[alone]], polygons[alone])
-            groups.append(np.flatnonzero(alone))
-        packing = _pack(xatlas, local, groups, side, density, padding)
-        placed, found_side, count, fits = yield from scaled(packing, number / _REPAIRS, 1 / _REPAIRS)
+            numbers = np.where(alone, numbers.max() + 1 + polygons, numbers)
+        numbers = np.unique(numbers, return_inverse=True)[1]
+        share = 1 / _REPAIRS
+        turned, boxes = yield from scaled(boxed(local, numbers), number * share, 0.6 * share)
+        packing = arranged(boxes, _area(local), side=side, density=texels_per_metre, padding=padding)
+        corner, found_side, scale = yield from scaled(packing, (number + 0.6) * share, 0.4 * share)
+        placed = (turned * scale + corner[numbers][:, None]) / found_side
         uv[charts.corners] = placed
-        density *= fits  # the next try begins where this one ended
         pairs = Layout(placed, triangles, min(found_side, CHECKED_SIDE)).overlapping()
         if not len(pairs):
             break
         alone |= np.isin(polygons, polygons[pairs])  # of charts that lie over themselves
-    return Atlas(uv, found_side, density, count, len(np.unique(polygons[alone])))
+    return Atlas(uv, found_side, scale, alone)
 
 
 def _xatlas():
@@ -170,8 +157,8 @@ def _pieces(positions: NDArray, triangles: NDArray, polygons: NDArray) -> list[N
     return np.split(by_piece, np.flatnonzero(np.diff(piece[by_piece])) + 1)
 
 
-def _chart(xatlas, positions: NDArray, triangles: NDArray, normals: NDArray) -> tuple[NDArray, list[float]]:
-    """(f, 3, 2) UVs of some triangles in metres, from charts of theirs alone, and the area of each chart."""
+def _chart(xatlas, positions: NDArray, triangles: NDArray, normals: NDArray) -> tuple[NDArray, NDArray[np.int64]]:
+    """UVs (f, 3, 2) of some triangles in metres, from charts of theirs alone, and the number (f,) of their chart."""
     keys = np.concatenate([triangles.reshape(-1, 1), np.rint(1000 * normals.reshape(-1, 3)).astype(np.int64)], 1)
     _, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     vertices = positions[triangles.ravel()[first]]
@@ -185,28 +172,19 @@ def _chart(xatlas, positions: NDArray, triangles: NDArray, normals: NDArray) -> 
     _, indices, uv = atlas.get_mesh(0)
     flat = (uv * np.array([atlas.width, atlas.height]))[indices].astype(np.float64)
     points = positions[triangles]
-    areas = []
+    charts = np.zeros(len(triangles), np.int64)  # 0: of none, as it has no area
     for number in range(atlas.get_mesh_chart_count(0)):
         faces = np.asarray(atlas.get_mesh_chart(0, number).faces)
         flat[faces] *= _metres(points[faces], flat[faces])
-        areas.append(_area(flat[faces]))
-    return flat, areas
+        charts[faces] = number + 1
+    flat[charts == 0] = 0
+    return flat, charts
 
 
 def _area(uv: NDArray) -> float:
     """Area of triangles (f, 3, 2)."""
     a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     return 0.5 * float(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
-
-
-def _density(areas: NDArray, side: int, padding: int) -> float:
-    """Texels a metre at which charts of these areas (n,) fill a texture, each a square with its padding."""
-    low, high = 0.0, side / max(float(areas.sum()) ** 0.5, 1e-300)
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        room = np.square(np.sqrt(areas / _FILLED) * middle + padding + _BESIDE).sum()
-        low, high = (middle, high) if room < side * side else (low, middle)
-    return max(low, 0.01 * high)
 
 
 def _metres(points: NDArray, flat: NDArray) -> NDArray[np.float64]:
@@ -253,51 +231,11 @@ def _torn(local: NDArray, positions: NDArray, triangles: NDArray, corners: NDArr
 
 
 def _laid_flat(points: NDArray, polygons: NDArray) -> NDArray[np.float64]:
-    """(f, 3, 2) UVs in metres of triangles (f, 3, 3): each polygon projected on its mean plane, all in a row."""
+    """(f, 3, 2) UVs in metres of triangles (f, 3, 3): each polygon projected on its mean plane."""
     face = np.unique(polygons, return_inverse=True)[1]
     cross = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
     normal = unit(np.stack([np.bincount(face, cross[:, axis]) for axis in range(3)], 1))
     first = unit(np.cross(normal, np.eye(3)[np.abs(normal).argmin(1)]))
     axes = np.stack([first, np.cross(normal, first)], 1)[face]       # (f, 2, 3)
-    flat = np.einsum("fcx,fax->fca", points - points.reshape(-1, 3).mean(0), axes)
-    low, high = np.full((len(normal), 2), np.inf), np.full((len(normal), 2), -np.inf)
-    np.minimum.at(low, face, flat.min(1))
-    np.maximum.at(high, face, flat.max(1))
-    width = high[:, 0] - low[:, 0]
-    row = np.cumsum(1.1 * width + 1e-3 * width.max()) - 1.1 * width
-    flat -= low[face][:, None]
-    flat[..., 0] += row[face][:, None]
+    flat: NDArray[np.float64] = np.einsum("fcx,fax->fca", points - points.reshape(-1, 3).mean(0), axes)
     return flat
-
-
-def _pack(xatlas, local: NDArray, pieces: list[NDArray[np.int64]], side: int | None, density: float, padding: int
-          ) -> Generator[float, None, tuple[NDArray, int, int, float]]:
-    """(F, 3, 2) UVs 0 to 1 of all charts in one texture, its side, the number of charts, and how much they shrank."""
-    scaled = local * density  # in texels, as xatlas's tolerances are absolute
-    meshes = []
-    for piece in pieces:
-        places, index = np.unique(scaled[piece].reshape(-1, 2), axis=0, return_inverse=True)
-        meshes.append((places.astype(np.float32), index.reshape(-1, 3).astype(np.uint32)))
-    scale = 1.0
-    for number in range(_TRIES):
-        yield number / _TRIES
-        atlas = xatlas.Atlas()  # a new one: packing again would find the charts of the time before
-        for mesh in meshes:
-            atlas.add_uv_mesh(*mesh)
-        pack = xatlas.PackOptions()
-        pack.padding, pack.texels_per_unit, pack.resolution = padding, scale, side or 0
-        atlas.generate(xatlas.ChartOptions(), pack)
-        if side is None:
-            side = max(atlas.width, atlas.height)
-        if atlas.atlas_count == 1 and max(atlas.width, atlas.height) <= side:
-            break
-        scale *= min(_SHRINK, 1.3 / max(1, atlas.atlas_count) ** 0.5)
-    else:
-        raise UserError(f"A texture of {side} x {side} is too small for the charts of this mesh; "
-                        "choose a higher resolution or a smaller padding.")
-    out = np.empty_like(local)
-    size = np.array([atlas.width, atlas.height]) / side
-    for number, piece in enumerate(pieces):
-        _, indices, uv = atlas.get_mesh(number)
-        out[piece] = (uv * size)[indices]
-    return out, side, int(atlas.chart_count), scale

@@ -11,7 +11,7 @@ from pathlib import Path
 import bpy
 
 from ..backend import methods
-from ..backend.atlas import place
+from ..backend.atlas import Placed, place
 from ..backend.errors import UserError
 from ..backend.progress import scaled
 from ..backend.record import BakeRecord
@@ -88,9 +88,9 @@ def _bake(jobs: list[Job], shared: bool, sizes: dict) -> Generator[float, None, 
     if shared:
         began = time.perf_counter()
         placing = place([job.texture.part for job in jobs if job.texture], **sizes)
-        uvs, side = yield from scaled(placing, 0, _PLACING)
+        places, side = yield from scaled(placing, 0, _PLACING)
         done, spent = _PLACING, (time.perf_counter() - began) / len(jobs)
-        bakes = [_timed(job.bake(uv=uv, side=side), spent) for job, uv in zip(jobs, uvs, strict=True)]
+        bakes = [_placed(job, placed, side, spent) for job, placed in zip(jobs, places, strict=True)]
     else:
         bakes = [job.bake() if job.texture is None else _textured(job, sizes) for job in jobs]
     for number, bake in enumerate(bakes):
@@ -108,16 +108,17 @@ def _textured(job: Job, sizes: dict) -> Generator[float, None, Transfer | Textur
     """The bake of an object to a texture of its own."""
     assert job.texture is not None
     began = time.perf_counter()
-    (uv,), side = yield from scaled(place([job.texture.part], **sizes), 0, _PLACING)
+    (placed,), side = yield from scaled(place([job.texture.part], **sizes), 0, _PLACING)
     spent = time.perf_counter() - began
-    return (yield from scaled(_timed(job.bake(uv=uv, side=side), spent), _PLACING, 1 - _PLACING))
+    return (yield from scaled(_placed(job, placed, side, spent), _PLACING, 1 - _PLACING))
 
 
-def _timed(bake: Generator[float, None, Transfer | TextureTransfer], spent: float
-           ) -> Generator[float, None, Transfer | TextureTransfer]:
-    """A bake whose record counts time spent before."""
-    found = yield from bake
-    return replace(found, record=replace(found.record, seconds=found.record.seconds + spent))
+def _placed(job: Job, placed: Placed, side: int, spent: float
+            ) -> Generator[float, None, Transfer | TextureTransfer]:
+    """The bake of an object whose place in a texture is known; its record counts the time that took."""
+    found = yield from job.bake(uv=placed.uv, side=side)
+    return replace(found, record=replace(found.record, seconds=found.record.seconds + spent,
+                                         single_faces=placed.single_faces))
 
 
 def finish_batch(context: bpy.types.Context, batch: Batch, results: Sequence[Result]) -> list[Outcome]:

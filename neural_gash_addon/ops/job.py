@@ -221,6 +221,10 @@ def finish(context: bpy.types.Context, job: Job, transfer: Transfer | TextureTra
         preview_off(obj)
         warning = str(error)
     apply_light(context.scene)  # every preview: the World's light may be another now, and twins share the bake
+    if record.single_faces:
+        alone = (f"{record.single_faces:,} of the faces of '{obj.name}' could not be unwrapped with their neighbours; "
+                 "each has a place of its own in the UV map.")
+        warning = f"{warning} {alone}" if warning else alone
     return record, warning
 
 

@@ -7,7 +7,7 @@ import os
 import re
 import tempfile
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import bpy
@@ -145,10 +145,12 @@ def _write(stem: str, transfer: TextureTransfer, folder: Path, half: bool, parts
                 raise UserError(f"There is a file '{path}' that no bake made; choose another folder.") from error
     side, filled, text = transfer.record.side, transfer.fill_map(), transfer.record.to_json()
     try:
-        for number, path in enumerate(paths):
-            exr.write(path, transfer.image(number, filled).reshape(side, side, 4), text, half)
-        with atomic(folder / f"{stem}.json") as draft:
-            draft.write_text((f'{text[:-1]}, "objects": {parts}}}' if parts else text) + "\n")
+        with ExitStack() as drafts:  # which take their places together, once all are whole
+            for number, path in enumerate(paths):
+                image = transfer.image(number, filled).reshape(side, side, 4)
+                exr.write(drafts.enter_context(atomic(path)), image, text, half)
+            beside = drafts.enter_context(atomic(folder / f"{stem}.json"))
+            beside.write_text((f'{text[:-1]}, "objects": {parts}}}' if parts else text) + "\n")
     except OSError as error:
         raise UserError(f"The textures cannot be written to '{folder}' ({reason(error)}).") from error
     return paths

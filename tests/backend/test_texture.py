@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from neural_gash_addon.backend import methods, metrics, texture
+from neural_gash_addon.backend import methods, metrics, packing, texture
 from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.errors import UserError
 from neural_gash_addon.backend.geometry import Surface, TriangleMesh
@@ -107,6 +107,42 @@ def test_too_small_a_texture_is_refused():
         atlas(surface(shapes.torus(), smooth=False), 16, padding=64)
 
 
+def test_boxes_are_apart_and_as_small_as_turning_makes_them():
+    """Rectangles turned by chance: the boxes are the rectangles again, and keep the padding's distance."""
+    rng = np.random.default_rng(0)
+    sides = rng.uniform(0.2, 3, (200, 2))
+    corners = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]]) * sides[:, None, None]
+    angle = rng.uniform(0, 7, 200)
+    turns = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], 1).reshape(-1, 2, 2)
+    local = np.einsum("nij,ntcj->ntci", turns, corners).reshape(-1, 3, 2)
+    charts = np.arange(200).repeat(2)
+    shuffled = rng.permutation(400)
+    turned, boxes = methods.run(packing.boxed(local[shuffled], charts[shuffled]))
+    np.testing.assert_allclose(boxes, np.sort(sides, 1)[:, ::-1], rtol=0.01)   # to a sixteenth of a degree
+    assert np.abs(turned[np.argsort(shuffled)].reshape(200, 6, 2).min(1)).max() < 1e-12
+    lengths = [np.linalg.norm(a - np.roll(a, 1, 1), axis=2) for a in (turned, local[shuffled])]
+    np.testing.assert_allclose(*lengths, atol=1e-12)
+    for padding, side in ((1, 256), (4, 512)):
+        lower, _, scale = methods.run(packing.arranged(boxes, float(sides.prod(1).sum()), side=side, density=None,
+                                                       padding=padding))
+        upper = lower + boxes * scale
+        assert lower.min() >= padding and upper.max() <= side - padding + 1e-9
+        apart = np.maximum(lower[:, None] - upper, lower - upper[:, None]).max(-1) + 1e9 * np.eye(200)
+        assert apart.min() > 2 * padding + 1 - 1e-9
+        assert (boxes * scale + 2 * padding + 1).prod(1).sum() > 0.88 * side ** 2   # well filled
+        _, grown, _ = methods.run(packing.arranged(boxes, 1.0, side=None, density=scale, padding=padding))
+        assert grown == pytest.approx(side, rel=0.03)
+
+
+@pytest.mark.parametrize("width", [1e-2, 1e-7])
+def test_long_and_thin_meshes_have_room(width):
+    """A skirting board, and a needle."""
+    strip = np.array([[0., 0, 0], [10, 0, 0], [10, width, 0], [0, width, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    found = atlas(surface(strip), 256)
+    assert np.ptp(found.uv, axis=0).max() > 0.95
+    assert len(methods.run(texture.bake(surface(strip), "analytic", 2, side=64)).texels)
+
+
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_atlas_does_not_depend_on_scale(scale):
     positions, triangles = shapes.torus()
@@ -124,6 +160,11 @@ def test_broken_faces_are_laid_out_without_a_crash():
     mesh = surface((positions, triangles))
     found = atlas(mesh, 256)
     assert np.isfinite(found.uv).all() and found.uv.min() >= 0 and found.uv.max() <= 1
+    assert 1 <= len(np.unique(mesh.polygons[found.alone])) < 40
+    assert not len(Layout(found.uv[mesh.corners], mesh.triangles, 512).overlapping())
+    result = methods.run(texture.bake(mesh, "analytic", 2, side=64))
+    assert result.record.single_faces >= 1 and methods.run(
+        texture.bake(surface(shapes.sphere(2)), "analytic", 2, side=64)).record.single_faces == 0
 
 
 def test_convex_mesh_equals_the_analytic_coefficients_across_seams():

@@ -35,6 +35,9 @@ def test_options_that_do_not_fit_are_refused(refused, blend, tmp_path):
     assert "--texture" in refused("bake", blend, "--object", "Ring", "--half", "--out", out)
     assert "--npz" in refused("bake", blend, "--object", "Ring", "--texture", 64, "--npz", tmp_path / "a.npz")
     assert "--texture" in refused("bake", blend, "--object", "Ring", "--gloss", "ggx", "--out", out)
+    assert "--texture" in refused("bake", blend, "--object", "Ring", "--padding", 4, "--out", out)
+    assert "padding" in refused("bake", blend, "--object", "Ring", "--texture", 64, "--padding", 0, "--out", out)
+    assert "texels per metre" in refused("bake", blend, "--object", "Ring", "--texture", "0/m", "--out", out)
     assert "resolution" in refused("bake", blend, "--object", "Ring", "--texture", 5, "--out", out)
     assert "no UV map" in refused("bake", blend, "--object", "Ring", "--texture", 64, "--uv-map", "X", "--out", out)
     assert not list(tmp_path.iterdir())
@@ -94,6 +97,15 @@ def test_several_objects_share_a_texture_as_large_as_they_need(run, blend, tmp_p
     baked = {r["object"]: r for r in records if "error" not in r}
     assert set(baked) == {"Ring", "Roof"} and baked["Ring"]["side"] == baked["Roof"]["side"]
     assert len(list((tmp_path / "maps").glob("*.exr"))) == 1
+
+
+def test_density_and_padding(run, blend):
+    sides = {}
+    for density, padding in ((20, 2), (40, 2), (40, 8)):
+        done = run("bake", blend, "--object", "Ring", "--texture", f"{density}/m", "--padding", padding, "--order", 2,
+                   "--method", "analytic", "--json")
+        sides[density, padding] = json.loads(done.stdout)["side"]
+    assert 1.3 * sides[20, 2] < sides[40, 2] < 2.1 * sides[20, 2] and sides[40, 8] > sides[40, 2] + 12
 
 
 def test_a_tolerance_that_the_file_holds_does_not_count(run, blend, tmp_path):

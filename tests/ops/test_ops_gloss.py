@@ -2,6 +2,8 @@
 """Glossy previews: the shader's pixels against NumPy, and what a light change does."""
 from __future__ import annotations
 
+from ctypes.util import find_library
+
 import numpy as np
 import pytest
 
@@ -104,6 +106,40 @@ def test_pixels_equal_numpy(shiny, settings, roughness, metallic, tilt, lobe):
         assert np.abs(expected - wrong)[inner].max() > 1e-2 * np.abs(expected).max()
     # pixels average smooth radiance over their filter, by chance: 256 samples leave a little
     assert np.abs(picture - expected)[inner].max() < 1e-3 * np.abs(expected).max()
+
+
+@pytest.mark.skipif(not find_library("EGL"), reason="EEVEE needs a graphics driver")
+def test_eevee_pixels_equal_numpy_to_half_precision(shiny, tmp_path):
+    """With images for colour and roughness besides: 23 textures in one material."""
+    floor, shader = shiny
+    tree = floor.data.materials[0].node_tree
+    for name, value in (("Base Color", ALBEDO), ("Roughness", [0.3] * 3)):
+        image = bpy.data.images.new(name, 4, 4, float_buffer=True, is_data=True)
+        image.pixels.foreach_set(np.tile([*value, 1], 16).astype(np.float32))
+        node = tree.nodes.new("ShaderNodeTexImage")
+        node.image = image
+        tree.links.new(node.outputs["Color"], shader.inputs[name])
+    shader.inputs["Metallic"].default_value = 1.0
+    assert bpy.ops.neural_gash.bake() == {"FINISHED"}
+    light = _light()
+    scene = bpy.context.scene
+    scene.camera = _camera()
+    scene.render.engine = "BLENDER_EEVEE" if bpy.app.version >= (5, 0, 0) else "BLENDER_EEVEE_NEXT"
+    scene.eevee.taa_render_samples, scene.render.filter_size = 1, 0.01
+    scene.render.resolution_x = scene.render.resolution_y = SIZE
+    scene.render.resolution_percentage = 100
+    if bpy.app.version >= (5, 0, 0):
+        scene.render.image_settings.media_type = "IMAGE"
+    scene.render.image_settings.file_format, scene.render.image_settings.color_depth = "OPEN_EXR", "32"
+    scene.render.filepath = str(tmp_path / "picture.exr")
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(scene.render.filepath)
+    picture = np.empty((SIZE, SIZE, image.channels), np.float32)
+    image.pixels.foreach_get(picture.ravel())
+    expected = np.maximum(_expected(np.array([0., 0, 1]), light, 0.3, 1.0), 0)  # it cannot show less
+    inner = (slice(8, -8), slice(8, -8))
+    assert expected[inner].max() > 1.2 * expected[inner].min() > 0
+    np.testing.assert_allclose(picture[..., :3][inner], expected[inner], atol=3e-3 * expected.max())
 
 
 def test_light_changes_fill_the_images_and_nothing_else(shiny, settings):

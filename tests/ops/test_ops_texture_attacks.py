@@ -254,3 +254,67 @@ def test_a_folder_without_a_beginning_is_refused(make, texture, refused, tmp_pat
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     texture.texture_folder = "maps"
     assert "begin it with //" in refused(bpy.ops.neural_gash.bake)
+
+
+def test_faces_that_cannot_be_unwrapped_are_said(make, texture, capfd):
+    texture.method = "analytic"
+    make([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (2, 0, 0), (2, 1, 0)], [(0, 1, 2, 3), (1, 2, 4, 5)], "Bow Tie")
+    assert bpy.ops.neural_gash.bake() == {"FINISHED"}
+    assert "1 of the faces of 'Bow Tie' could not be unwrapped" in capfd.readouterr().out
+
+
+def test_a_full_disk_leaves_the_earlier_bake_whole(make, texture, refused, snapshot, tmp_path, monkeypatch):
+    from neural_gash_addon.backend import exr
+    texture.texture_folder, texture.method = str(tmp_path), "analytic"
+    make()
+    assert bpy.ops.neural_gash.bake() == {"FINISHED"}
+    before, files = snapshot(), {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+    written, real = [], exr.write
+
+    def fills_up(path, *arguments):
+        written.append(path)
+        if len(written) == 3:   # the last of three images
+            raise OSError(28, "No space left on device")
+        real(path, *arguments)
+
+    monkeypatch.setattr(exr, "write", fills_up)
+    texture.method, texture.side = "embree", 32
+    assert "no space left on device" in refused(bpy.ops.neural_gash.bake)
+    assert snapshot() == before and {p.name: p.read_bytes() for p in tmp_path.iterdir()} == files
+    monkeypatch.undo()
+    assert bpy.ops.neural_gash.preview() == {"FINISHED"}   # off and on again: it is still the bake's
+    assert bpy.ops.neural_gash.preview() == {"FINISHED"}
+
+
+def test_an_unreadable_normal_map_is_said(make, texture, refused, snapshot, tmp_path):
+    obj = make(*FLOOR)
+    obj.data.uv_layers.new(name="Mine")
+    _normal_map(obj, 0.5, "Mine")
+    (tmp_path / "bumps.png").write_bytes(b"no image")
+    texture_node = next(n for n in obj.data.materials[0].node_tree.nodes if n.type == "TEX_IMAGE")
+    texture_node.image = bpy.data.images.load(str(tmp_path / "bumps.png"))
+    before = snapshot()
+    said = refused(bpy.ops.neural_gash.bake)
+    assert f"The normal map of the material '{obj.data.materials[0].name}' cannot be read" in said
+    assert snapshot() == before
+    texture_node.image = None
+    assert "normal map" in refused(bpy.ops.neural_gash.bake)
+
+
+def test_flipped_uvs_give_the_same_bake_flipped(make, texture):
+    """A UV map seen from behind is a place like any other, as long as no faces lie over each other."""
+    texture.uv_map, texture.rays, texture.side, found = "Mine", 4096, 64, []
+    for flip in (1, -1):
+        obj = make([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0), (1, -1, 2), (1, 1, 2)],
+                   [(0, 1, 2, 3), (1, 4, 5, 2)], f"Corner {flip}")
+        layer = obj.data.uv_layers.new(name="Mine")
+        for loop, (u, v) in enumerate([(.02, .02), (.48, .02), (.48, .98), (.02, .98),
+                                       (.52, .02), (.98, .02), (.98, .98), (.52, .98)]):
+            layer.uv[loop].vector = (0.5 + flip * (u - 0.5), v)
+        assert bpy.ops.neural_gash.bake() == {"FINISHED"}
+        image = obj.data["neural_gash_images"]["0"]
+        pixels = np.empty((64, 64, 4), np.float32)
+        image.pixels.foreach_get(pixels.ravel())
+        found.append(pixels[:, ::flip])
+    assert np.abs(found[0]).max() > 0.2
+    np.testing.assert_allclose(found[0], found[1], atol=0.01)
