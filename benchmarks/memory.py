@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Peak memory of a bake of a million vertices, in a process of its own."""
+"""Peak memory of a bake, in a process of its own."""
 from __future__ import annotations
 
 import json
@@ -18,8 +18,8 @@ def _megabytes(field: str) -> float:
         return next(int(line.split()[1]) for line in file if line.startswith(field)) * 1024 / 1e6
 
 
-def _child(rays: int) -> None:
-    """Build the mesh, bake it, report."""
+def _child(method: str, vertices: int, order: int, rays: int | None) -> None:
+    """Build a knot, bake it, report."""
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
     from meshes import knot
 
@@ -27,12 +27,23 @@ def _child(rays: int) -> None:
     from neural_gash_addon.backend.geometry import TriangleMesh
 
     start = _megabytes("VmRSS")
-    mesh = TriangleMesh.from_triangles(*knot(VERTICES))
+    mesh = TriangleMesh.from_triangles(*knot(vertices))
     built, held = _megabytes("VmHWM"), _megabytes("VmRSS")
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak counts anew from here
-    transfer = methods.run(methods.bake(mesh, order=ORDER, rays=rays))
+    transfer = methods.run(methods.bake(mesh, method, order, rays=rays))
     print(json.dumps({"vertices": len(mesh.points), "seconds": transfer.record.seconds, "built": built - start,
                       "held": held - start, "baked": _megabytes("VmHWM") - start}))
+
+
+def peak(method: str, vertices: int, order: int, rays: int | None) -> dict[str, float] | str:
+    """Vertices, seconds, and MB over the process's start: built, held, baked. Or why there are none."""
+    if not Path("/proc/self/status").exists():
+        return "needs Linux's /proc"
+    done = subprocess.run([sys.executable, __file__, method, str(vertices), str(order), str(rays or 0)],
+                          capture_output=True, text=True, check=False)
+    if done.returncode:
+        return f"the bake failed: {done.stderr.strip().splitlines()[-1:]}"
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def measure(table: Table, quick: bool) -> None:
@@ -40,14 +51,10 @@ def measure(table: Table, quick: bool) -> None:
     rays = 16 if quick else RAYS
     table.heading("Memory", "Peak resident memory over the process's start (after imports) of building a mesh and "
                             f"of baking it (what the mesh holds included) at order {ORDER}, {rays} rays.")
-    if not Path("/proc/self/status").exists():
-        table.absent("peak memory", "needs Linux's /proc")
+    got = peak("embree", VERTICES, ORDER, rays)
+    if isinstance(got, str):
+        table.absent("peak memory", got)
         return
-    done = subprocess.run([sys.executable, __file__, str(rays)], capture_output=True, text=True, check=False)
-    if done.returncode:
-        table.absent("peak memory", f"the bake failed: {done.stderr.strip().splitlines()[-1:]}")
-        return
-    got = json.loads(done.stdout.splitlines()[-1])
     table.add(f"{got['vertices']} vertices: mesh built from triangles (holds {got['held']:.0f} MB)",
               f"{got['built']:.0f} MB", "", got["built"], 1000, " MB", most=True)
     table.add(f"{got['vertices']} vertices: bake, {got['seconds']:.1f} s", f"{got['baked']:.0f} MB", "",
@@ -55,4 +62,4 @@ def measure(table: Table, quick: bool) -> None:
 
 
 if __name__ == "__main__":
-    _child(int(sys.argv[1]))
+    _child(sys.argv[1], *(int(text) for text in sys.argv[2:4]), int(sys.argv[4]) or None)
