@@ -56,7 +56,7 @@ def memory(rows: list[chart_draw.Row]) -> str:
             elif isinstance(own[0]["memory_mb"], float | int):
                 cells.append(f"{own[0]['seconds']:.3g} s, {own[0]['memory_mb']:.0f} MB")
             else:
-                cells.append(own[0]["note"] or str(own[0]["memory_mb"]))
+                cells.append(own[0]["note"])
         lines.append(f"| {method} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -88,7 +88,7 @@ def main() -> int:
         there = {block["key"] for block in blocks}
         missing = [case for case in cases if case.key not in there]
         with tqdm(total=len(missing), unit="mesh", smoothing=0, mininterval=0.5,
-                  bar_format="{desc}: {percentage:.0f} %|{bar}| {elapsed}, {remaining} left") as bar:
+                  bar_format="{desc}{percentage:.0f} %|{bar}| {elapsed}, {remaining} left") as bar:
             for number, case in enumerate(missing):
                 bar.set_description(case.key)
                 blocks.append(methods.run(chart_measure.measure(case, lights),

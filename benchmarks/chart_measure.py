@@ -163,6 +163,13 @@ def measure(case: Case, lights: list[NDArray]) -> Generator[float, None, dict[st
                                             rays=setting.rays, seed=seed, threads=setting.threads)
             return np.concatenate(found.coefficients), found.record
     settings = _settings(case, len(points.points))
+    memory: dict[str, dict[str, float] | str] = {}
+    if case.sweep == "scale":  # first, so that what the machine has no room for is not tried here
+        for name in dict.fromkeys(setting.method for setting in settings):
+            rays = compare.BASELINE_RAYS if methods.METHODS[name].traces else None
+            memory[name] = peak(name, int(case.mesh.split()[1]), ORDER, rays)
+            yield 0.0
+        settings = [setting for setting in settings if not isinstance(memory[setting.method], str)]
     sees = methods.METHODS["embree"].sees
     assert sees is not None
     scene = sees(points, ())
@@ -184,13 +191,13 @@ def measure(case: Case, lights: list[NDArray]) -> Generator[float, None, dict[st
         out += [_row(case, len(points.points), m, note) for m in found]
         out.append({"points": len(points.points), "method": "reference", "order": order,
                     "rays": compare.REFERENCE_RAYS, **truth.floor(lights)})
-    if case.sweep == "scale":
-        for name in dict.fromkeys(setting.method for setting in settings):
-            rays = compare.BASELINE_RAYS if methods.METHODS[name].traces else None
-            got = peak(name, int(case.mesh.split()[1]), ORDER, rays)
-            for row in out:
-                if row["method"] == name:
-                    row["memory_mb"] = got if isinstance(got, str) else got["baked"]
+    for name, got in memory.items():
+        if isinstance(got, str):
+            out.append({"points": len(mesh.points), "method": name, "order": ORDER, "note": got})
+            continue
+        for row in out:
+            if row["method"] == name:
+                row["memory_mb"] = got["baked"]
     return {"key": case.key, "mesh": case.mesh, "category": case.category, "sweep": case.sweep, **about(),
             "rows": [[_short(row.get(column)) for column in COLUMNS] for row in out]}
 

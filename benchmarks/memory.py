@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,8 @@ from pathlib import Path
 from table import Table
 
 VERTICES, ORDER, RAYS = 1_000_000, 5, 64
+# What a bake may take: GB of addresses, before the machine swaps; and seconds, before nobody waits any longer.
+MOST, LONGEST = 10, 120
 
 
 def _megabytes(field: str) -> float:
@@ -26,6 +29,7 @@ def _child(method: str, vertices: int, order: int, rays: int | None) -> None:
     from neural_gash_addon.backend import methods
     from neural_gash_addon.backend.geometry import TriangleMesh
 
+    resource.setrlimit(resource.RLIMIT_AS, (MOST << 30, MOST << 30))
     start = _megabytes("VmRSS")
     mesh = TriangleMesh.from_triangles(*knot(vertices))
     built, held = _megabytes("VmHWM"), _megabytes("VmRSS")
@@ -39,10 +43,15 @@ def peak(method: str, vertices: int, order: int, rays: int | None) -> dict[str, 
     """Vertices, seconds, and MB over the process's start: built, held, baked. Or why there are none."""
     if not Path("/proc/self/status").exists():
         return "needs Linux's /proc"
-    done = subprocess.run([sys.executable, __file__, method, str(vertices), str(order), str(rays or 0)],
-                          capture_output=True, text=True, check=False)
+    try:
+        done = subprocess.run([sys.executable, __file__, method, str(vertices), str(order), str(rays or 0)],
+                              capture_output=True, text=True, check=False, timeout=LONGEST)
+    except subprocess.TimeoutExpired:
+        return f"more than {LONGEST} s"
     if done.returncode:
-        return f"the bake failed: {done.stderr.strip().splitlines()[-1:]}"
+        last = done.stderr.strip().splitlines()[-1:]
+        short = not last or any(word in last[0] for word in ("MemoryError", "allocate", "bad_alloc"))
+        return f"more than {MOST} GB" if short else f"the bake failed: {last[0]}"
     return json.loads(done.stdout.splitlines()[-1])
 
 

@@ -48,7 +48,7 @@ class Scale:
     seeds: int
 
 
-FULL = Scale(2000, 800, ("fist", "coupling"), 4, 16)
+FULL = Scale(2000, 800, ("fist", "coupling"), 2, 16)
 SMALL = Scale(300, 60, (), 1, 4)
 
 
