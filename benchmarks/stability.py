@@ -2,7 +2,8 @@
 """Where methods fail: a table of trials and methods, `python benchmarks/stability.py [--quick]`.
 
 A cell has the typical error (RMS over points, median over the disturbed cases), the worst of any point, and the ratio
-of the worst case's RMS to that of the undisturbed ones.
+of the worst case's RMS to that of the undisturbed ones. Trials that are in the file of numbers already are not run
+again; remove it to start afresh.
 """
 from __future__ import annotations
 
@@ -13,6 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -22,11 +24,12 @@ import trials_surface
 from chart_measure import about
 from page import fill
 from tqdm import tqdm
-from trial import FULL, ORDER, SMALL, Scale, Variant, Variants, undisturbed
+from trial import FULL, ORDER, REFERENCE_SEED, SMALL, Scale, Variant, Variants, undisturbed
 
 from neural_gash_addon.backend import compare, methods, metrics
 from neural_gash_addon.backend.compare import Setting
 from neural_gash_addon.backend.errors import UserError
+from neural_gash_addon.backend.exchange import atomic
 from neural_gash_addon.backend.geometry import TriangleMesh
 
 RAYS = 64
@@ -170,6 +173,13 @@ def noise_table(found: Sequence[dict]) -> str:
     return "\n".join(lines)
 
 
+def _save(path: Path | None, results: dict[str, Any]) -> None:
+    """What is known so far."""
+    if path is not None:
+        with atomic(path) as draft:
+            draft.write_text(json.dumps(results, indent=0) + "\n", encoding="utf-8")
+
+
 def main() -> int:
     """Run all trials and print."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -183,18 +193,24 @@ def main() -> int:
     compare.warm(chosen)
     trials = [(group, trial) for group, found in GROUPS.items() for trial in found
               if not arguments.only or arguments.only in trial.__name__]
-    cells: list[Cell] = []
+    results: dict[str, Any] = {"trials": {}, "noise": {}}
+    if arguments.out and arguments.out.is_file():
+        results = json.loads(arguments.out.read_text(encoding="utf-8"))
     with tqdm(trials, unit="trial") as bar:
         for group, trial in bar:
             bar.set_description(trial.__name__)
-            cells += tried(group, trial, scale, chosen)
-    seeds = [] if arguments.only else noise(scale, chosen)
-    origin = about()
-    texts = {"origin": f"Machine: {origin['machine']}. Commit: {origin['commit']}.", "table": table(cells),
-             "noise": noise_table(seeds), "red": red_list(cells)}
-    if arguments.out:
-        arguments.out.write_text(json.dumps({**origin, "cells": [asdict(cell) for cell in cells], "noise": seeds},
-                                            indent=0) + "\n", encoding="utf-8")
+            if trial.__name__ not in results["trials"]:
+                found = [asdict(cell) for cell in tried(group, trial, scale, chosen)]
+                results["trials"][trial.__name__] = {**about(), "cells": found}
+                _save(arguments.out, results)
+    if not arguments.only and not results["noise"]:
+        results["noise"] = {**about(), "rows": noise(scale, chosen)}
+        _save(arguments.out, results)
+    parts = [*results["trials"].values(), *([results["noise"]] if results["noise"] else [])]
+    machines, commits = (", ".join(sorted({part[name] for part in parts})) for name in ("machine", "commit"))
+    cells = [Cell(**cell) for _, trial in trials for cell in results["trials"][trial.__name__]["cells"]]
+    texts = {"origin": f"Machine: {machines}. Commit: {commits}. Seed 0; {REFERENCE_SEED} of the references.",
+             "table": table(cells), "noise": noise_table(results["noise"].get("rows", [])), "red": red_list(cells)}
     if arguments.page:
         fill(arguments.page, texts)
     print("\n\n".join(texts.values()))

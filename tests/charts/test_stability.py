@@ -83,3 +83,17 @@ def test_the_undisturbed_truth_is_the_bake_with_many_rays():
     host, = undisturbed(SMALL)
     many = methods.run(compare.vertex_bake(host.mesh)(Setting("embree", 3, 16384), 5))[0][host.rows]
     assert np.abs(many - host.truth).max() < 0.01
+
+
+def test_what_is_there_is_not_run_again(tmp_path, monkeypatch, capsys):
+    import json
+    out, page = tmp_path / "stability.json", tmp_path / "page.md"
+    page.write_text("".join(f"<!-- {name} -->\n<!-- end -->\n" for name in ("origin", "table", "noise", "red")))
+    monkeypatch.setattr(sys, "argv", ["stability", "--quick", "--only", "dark", "--out", str(out), "--page", str(page)])
+    assert stability.main() == 0
+    known = json.loads(out.read_text())
+    assert set(known["trials"]) == {"dark"} and known["trials"]["dark"]["commit"]
+    monkeypatch.setattr(stability, "tried", None)
+    first = page.read_text()
+    assert stability.main() == 0 and page.read_text() == first and "| dark | 0 / 0 %" in first
+    assert "Commit: " in first and json.loads(out.read_text()) == known
