@@ -90,7 +90,8 @@ def _finish(figure: Any, axes: Sequence[Axes], path: Path) -> None:
     for panel in axes:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, fontsize=8)
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=3 if len(axes) == 1 else 4,
+                  fontsize=8)
     figure.savefig(path, dpi=100)
     pyplot.close(figure)
 
@@ -99,7 +100,8 @@ def _figure(panels: int) -> tuple[Any, list[Axes]]:
     """A figure with so many panels, at most three in a row."""
     columns = min(panels, 3) if panels != 4 else 2
     lines = -(-panels // columns)
-    figure, axes = pyplot.subplots(lines, columns, figsize=(5.4 * columns, 4.2 * lines + 0.8), squeeze=False,
+    width = max(5.4 * columns, 9.0)  # of the legend
+    figure, axes = pyplot.subplots(lines, columns, figsize=(width, 4.2 * lines + 0.9), squeeze=False,
                                    layout="constrained")
     flat = list(axes.ravel())
     for unused in flat[panels:]:
@@ -156,7 +158,7 @@ def draw(rows: Sequence[Row], folder: Path) -> list[Path]:
     if beside:
         figure, axes = _figure(1)
         _panel(axes[0], beside, "openness")
-        axes[0].set_title(f"Openness alone ({_meshes(beside)}): all of ours give 9 coefficients, Cycles this one")
+        axes[0].set_title(f"Openness alone ({_meshes(beside)}); only Cycles bakes nothing else")
         _finish(figure, axes, folder / "openness.png")
         drawn.append(folder / "openness.png")
     return drawn
