@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Where methods fail: a table of trials and methods, `python benchmarks/stability.py [--quick]`.
 
-A cell has the typical error (RMS over points, median over the disturbed cases), the worst of any point, and the ratio
-of the worst case's RMS to that of the undisturbed ones. Trials that are in the file of numbers already are not run
+A cell has the typical error (RMS over points, median over the disturbed cases), the worst of any point, and the largest
+ratio of a case's RMS to that of the same mesh undisturbed. Trials that are in the file of numbers already are not run
 again; remove it to start afresh.
 """
 from __future__ import annotations
@@ -24,7 +24,7 @@ import trials_surface
 from chart_measure import about
 from page import fill
 from tqdm import tqdm
-from trial import FULL, ORDER, REFERENCE_SEED, SMALL, Scale, Variant, Variants, undisturbed
+from trial import FULL, ORDER, REFERENCE_SEED, SMALL, Pairs, Scale, Variant, undisturbed
 
 from neural_gash_addon.backend import compare, methods, metrics
 from neural_gash_addon.backend.compare import Setting
@@ -34,7 +34,8 @@ from neural_gash_addon.backend.geometry import TriangleMesh
 
 RAYS = 64
 RED_RATIO, RED_ERROR = 1.5, 0.01  # a red cell's worst case has so many times the error, and so much more in all
-GROUPS: dict[str, tuple[Callable[[Scale], Variants], ...]] = {**trials_surface.TRIALS, **trials_scene.TRIALS}
+_NOTHING = 1e-6  # an error below which all is rounding
+GROUPS: dict[str, tuple[Callable[[Scale], Pairs], ...]] = {**trials_surface.TRIALS, **trials_scene.TRIALS}
 
 
 @dataclass(frozen=True)
@@ -46,17 +47,15 @@ class Cell:
     method: str
     typical: float       # RMS over points, median over the disturbed cases
     worst: float         # of any point of any of them
-    worst_case: str      # where the RMS is largest
+    worst_case: str      # whose RMS is the largest beside that of the same mesh undisturbed
     worst_typical: float  # and how large
-    calm: float          # RMS of the undisturbed cases, median
+    calm: float          # RMS of that mesh undisturbed
     refused: str = ""
 
     @property
     def ratio(self) -> float:
         """Of the worst case to the undisturbed."""
-        if self.worst_typical <= 1e-6:
-            return 0.0 if self.calm > 0 else 1.0
-        return self.worst_typical / self.calm if self.calm > 0 else float("inf")
+        return _ratio(self.worst_typical, self.calm)
 
     @property
     def red(self) -> bool:
@@ -80,26 +79,36 @@ def _baked(mesh: TriangleMesh, setting: Setting) -> np.ndarray:
     return methods.run(compare.vertex_bake(mesh)(setting, 0))[0]
 
 
+def _ratio(error: float, calm: float) -> float:
+    """Of an error to the undisturbed one; 0 where there is none at all, and 1 where there is neither."""
+    if error <= _NOTHING:
+        return 0.0 if calm > _NOTHING else 1.0
+    return error / calm if calm > _NOTHING else float("inf")
+
+
 def _rms(errors: np.ndarray) -> float:
     return float(np.sqrt(np.square(errors).mean()))
 
 
-def tried(group: str, trial: Callable[[Scale], Variants], scale: Scale, chosen: Sequence[Setting]) -> list[Cell]:
+def tried(group: str, trial: Callable[[Scale], Pairs], scale: Scale, chosen: Sequence[Setting]) -> list[Cell]:
     """A trial with all methods."""
-    calm, disturbed = trial(scale)
+    pairs = trial(scale)
     cells = []
     for setting in chosen:
         try:
-            rest = float(np.median([_rms(_errors(variant, setting)) for variant in calm]))
-            errors = [_errors(variant, setting) for variant in disturbed]
+            cases = []
+            for calm, disturbed in pairs:
+                rest = float(np.median([_rms(_errors(variant, setting)) for variant in calm]))
+                cases += [(variant.label, _errors(variant, setting), rest) for variant in disturbed]
         except UserError as error:
             none = float("nan")
             cells.append(Cell(group, trial.__name__, setting.method, none, none, "", none, none, str(error)))
             continue
-        means = [_rms(e) for e in errors]
-        worst = int(np.argmax(means))
+        means = [_rms(errors) for _, errors, _ in cases]
+        worst = max(range(len(cases)), key=lambda case: (_ratio(means[case], cases[case][2]), means[case]))
         cells.append(Cell(group, trial.__name__, setting.method, float(np.median(means)),
-                          max(float(e.max()) for e in errors), disturbed[worst].label, means[worst], rest))
+                          max(float(errors.max()) for _, errors, _ in cases), cases[worst][0], means[worst],
+                          cases[worst][2]))
     return cells
 
 

@@ -34,7 +34,7 @@ class Variant:
     errors: Callable[[Sequence[NDArray]], NDArray[np.float64]]  # of their coefficients (N, K): (n,) of points
 
 
-Variants = tuple[list[Variant], list[Variant]]  # undisturbed, and disturbed
+Pairs = list[tuple[list[Variant], list[Variant]]]  # undisturbed, and what is to be as good as that
 
 
 @dataclass(frozen=True)
@@ -165,10 +165,9 @@ def undisturbed(scale: Scale) -> list[Undisturbed]:
     return [Undisturbed(name, geometry, scale) for name, geometry in hosts(scale)]
 
 
-def each(scale: Scale, disturb: Callable[[Undisturbed], Iterable[Variant]]) -> Variants:
-    """The hosts, and what `disturb` makes of each."""
-    found = undisturbed(scale)
-    return [host.variant for host in found], [variant for host in found for variant in disturb(host)]
+def each(scale: Scale, disturb: Callable[[Undisturbed], Iterable[Variant]]) -> Pairs:
+    """Each host, and what `disturb` makes of it."""
+    return [([host.variant], list(disturb(host))) for host in undisturbed(scale)]
 
 
 def with_normals(mesh: TriangleMesh, normals: NDArray) -> TriangleMesh:

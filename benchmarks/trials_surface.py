@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from trial import (
     ORDER,
     Arrays,
+    Pairs,
     Scale,
     Undisturbed,
     Variant,
-    Variants,
     against,
     box,
     each,
@@ -35,7 +35,7 @@ from neural_gash_addon.backend.geometry import TriangleMesh
 _TURNS = (((1, 0, 0), 90), ((0, 0, 1), 37), ((1, 2, 3), 141), ((-3, 1, 1), 73))
 
 
-def rotate(scale: Scale) -> Variants:
+def rotate(scale: Scale) -> Pairs:
     """A turned mesh must get the turned answer: a method that knows up from down has learnt its training set."""
     def disturb(host: Undisturbed):
         for axis, degrees in _TURNS:
@@ -46,7 +46,7 @@ def rotate(scale: Scale) -> Variants:
     return each(scale, disturb)
 
 
-def translate_object(scale: Scale) -> Variants:
+def translate_object(scale: Scale) -> Pairs:
     """An object 10,000 times its size away from the origin: scenes are built where the map puts them."""
     def disturb(host: Undisturbed):
         positions, triangles = host.geometry[0] + (1e4, -1e4, 1e4), host.geometry[1]
@@ -58,7 +58,7 @@ def translate_object(scale: Scale) -> Variants:
     return each(scale, disturb)
 
 
-def translate_coordinates(scale: Scale) -> Variants:
+def translate_coordinates(scale: Scale) -> Pairs:
     """The same with the distance in the mesh's own float32 coordinates, which then have steps of a thousandth of it."""
     def disturb(host: Undisturbed):
         away = (host.geometry[0] + (1e4, -1e4, 1e4)).astype(np.float32).astype(np.float64)
@@ -71,7 +71,7 @@ def translate_coordinates(scale: Scale) -> Variants:
     return each(scale, disturb)
 
 
-def scaled(scale: Scale) -> Variants:
+def scaled(scale: Scale) -> Pairs:
     """A coin and a city: transfer has no unit of length."""
     def disturb(host: Undisturbed):
         for factor in (1e-3, 1e-1, 1e1, 1e3):
@@ -80,7 +80,7 @@ def scaled(scale: Scale) -> Variants:
     return each(scale, disturb)
 
 
-def mirror(scale: Scale) -> Variants:
+def mirror(scale: Scale) -> Pairs:
     """A mirrored mesh must get the mirrored answer: half of most models is made so."""
     there, back = sh.evaluate(np.array([[0.3, 0.5, 0.8], [-0.3, 0.5, 0.8]]) / np.sqrt(0.98), ORDER)
     signs = np.where(np.isclose(there, back), 1.0, -1.0)  # of each harmonic in the mirror
@@ -92,7 +92,7 @@ def mirror(scale: Scale) -> Variants:
     return each(scale, disturb)
 
 
-def permute_vertices(scale: Scale) -> Variants:
+def permute_vertices(scale: Scale) -> Pairs:
     """Another numbering of the vertices: files and modifiers number them as they like."""
     def disturb(host: Undisturbed):
         order = np.random.default_rng(1).permutation(len(host.geometry[0]))
@@ -102,7 +102,7 @@ def permute_vertices(scale: Scale) -> Variants:
     return each(scale, disturb)
 
 
-def shuffle_triangles(scale: Scale) -> Variants:
+def shuffle_triangles(scale: Scale) -> Pairs:
     """Another order of the triangles, and of the corners in each."""
     def disturb(host: Undisturbed):
         rng = np.random.default_rng(2)
@@ -163,32 +163,30 @@ def decimated(geometry: Arrays, passes: int = 3) -> Arrays:
     return positions[used], index.reshape(-1, 3).astype(np.int32)
 
 
-def subdivide(scale: Scale) -> Variants:
+def subdivide(scale: Scale) -> Pairs:
     """The same surface with four times the triangles: the answer at the old vertices must not move."""
     return each(scale, lambda host: [host.same("subdivided", smooth(subdivided(host.geometry)))])
 
 
-def decimate(scale: Scale) -> Variants:
+def decimate(scale: Scale) -> Pairs:
     """Fewer triangles. The shape is another then, and so is the truth: each is held to its own."""
     return each(scale, lambda host: [own(f"{host.name}, decimated", smooth(decimated(host.geometry)), scale)])
 
 
-def slivers(scale: Scale) -> Variants:
+def slivers(scale: Scale) -> Pairs:
     """Long thin triangles, as CAD programs leave them: the same surface, cut near its corners."""
     def disturb(host: Undisturbed):
-        geometry = host.geometry
-        for _ in range(2):
-            geometry = fanned(geometry, np.ones(len(geometry[1]), bool), (0.96, 0.02, 0.02))
-        yield host.same("slivers", smooth(geometry))
+        everywhere = np.ones(len(host.geometry[1]), bool)
+        yield host.same("slivers", smooth(fanned(host.geometry, everywhere, (0.96, 0.02, 0.02))))
 
     return each(scale, disturb)
 
 
-def uneven_density(scale: Scale) -> Variants:
-    """Half of the mesh 27 times as dense as the other: detail is where somebody modelled it."""
+def uneven_density(scale: Scale) -> Pairs:
+    """Half of the mesh nine times as dense as the other: detail is where somebody modelled it."""
     def disturb(host: Undisturbed):
         geometry = host.geometry
-        for _ in range(3):
+        for _ in range(2):
             centres = geometry[0][geometry[1]].mean(1)
             geometry = fanned(geometry, centres[:, 0] > 0, (1 / 3, 1 / 3, 1 / 3))
         yield host.same("uneven", smooth(geometry))
@@ -196,7 +194,7 @@ def uneven_density(scale: Scale) -> Variants:
     return each(scale, disturb)
 
 
-def t_junctions(scale: Scale) -> Variants:
+def t_junctions(scale: Scale) -> Pairs:
     """Half of the triangles split without their neighbours: no edges join there, and rays may slip through."""
     def disturb(host: Undisturbed):
         chosen = np.random.default_rng(3).random(len(host.geometry[1])) < 0.5
@@ -210,7 +208,7 @@ def _floor_and_post(pieces: int) -> Arrays:
     return join(box((1, 1, 0.1), pieces), box((0.2, 0.2, 0.5), max(2, pieces // 3), (0.1, 0.05, 0.3001)))
 
 
-def pole(scale: Scale) -> Variants:
+def pole(scale: Scale) -> Pairs:
     """Normals at and around -e_y, the pole of the motor (equation 5), where half angles change their sign."""
     geometry = _floor_and_post(max(3, round((scale.vertices / 8) ** 0.5)))
     base = flat(geometry)
@@ -223,11 +221,11 @@ def pole(scale: Scale) -> Variants:
                                 for name in ("positions", "points", "normals", "clearance")})
         return against(label, mesh, rows, sh.rotate(truth.T, matrix).T)
 
-    return ([turned(f"{degrees:g}° beside e_z", (0, 1, 0), degrees) for degrees in (1e-3, 1, 5)],
-            [turned(f"{degrees:g}° beside -e_y", (1, 0, 0), 90 + degrees) for degrees in (0, 1e-5, 1e-3, 0.1, 1)])
+    return [([turned(f"{degrees:g}° beside e_z", (0, 1, 0), degrees) for degrees in (1e-3, 1, 5)],
+             [turned(f"{degrees:g}° beside -e_y", (1, 0, 0), 90 + degrees) for degrees in (0, 1e-5, 1e-3, 0.1, 1)])]
 
 
-def flipped_normals(scale: Scale) -> Variants:
+def flipped_normals(scale: Scale) -> Pairs:
     """Normals that point into the mesh, faces as they were: an import gone wrong. Points then see the inside."""
     def disturb(host: Undisturbed):
         yield own(f"{host.name}, flipped", with_normals(host.mesh, -host.mesh.normals), scale)
@@ -235,13 +233,13 @@ def flipped_normals(scale: Scale) -> Variants:
     return each(scale, disturb)
 
 
-def averaged_normals(scale: Scale) -> Variants:
+def averaged_normals(scale: Scale) -> Pairs:
     """Boxes shaded smooth: normals that belong to no face, a third of whose hemisphere is below the surface."""
     geometry = _floor_and_post(max(3, round((scale.vertices / 8) ** 0.5)))
-    return [own("flat", flat(geometry), scale)], [own("averaged", smooth(geometry), scale)]
+    return [([own("flat", flat(geometry), scale)], [own("averaged", smooth(geometry), scale)])]
 
 
-def split_normals(scale: Scale) -> Variants:
+def split_normals(scale: Scale) -> Pairs:
     """A smooth mesh shaded flat: six points where there was one, each with a normal of its own."""
     return each(scale, lambda host: [own(f"{host.name}, flat", flat(host.geometry), scale)])
 
