@@ -37,7 +37,8 @@ def _igl(mesh: TriangleMesh) -> Callable[[int, int], NDArray]:
     return bake
 
 
-def _cycles(mesh: TriangleMesh) -> Callable[[int, int], NDArray]:
+def cycles_openness(mesh: TriangleMesh) -> Callable[[int, int], NDArray]:
+    """Cycles' bake of ambient occlusion to a mesh's vertices (V,), by samples and seed; empties the file."""
     import bpy
 
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -102,7 +103,7 @@ def measure(table: Table, threads: int) -> None:
         return _ours(mesh, seed, threads)
 
     goal = _error(ours)
-    for label, make in (("libigl embree.ambient_occlusion", _igl), ("Cycles AO bake", _cycles)):
+    for label, make in (("libigl embree.ambient_occlusion", _igl), ("Cycles AO bake", cycles_openness)):
         try:
             peer = make(mesh)
         except (ImportError, OSError, RuntimeError) as reason:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Peak memory of a bake of a million vertices, in a process of its own."""
+"""Peak memory of a bake, in a process of its own."""
 from __future__ import annotations
 
 import json
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,8 @@ from pathlib import Path
 from table import Table
 
 VERTICES, ORDER, RAYS = 1_000_000, 5, 64
+# What a bake may take: GB of addresses, before the machine swaps; and seconds, before nobody waits any longer.
+MOST, LONGEST = 10, 120
 
 
 def _megabytes(field: str) -> float:
@@ -18,21 +21,38 @@ def _megabytes(field: str) -> float:
         return next(int(line.split()[1]) for line in file if line.startswith(field)) * 1024 / 1e6
 
 
-def _child(rays: int) -> None:
-    """Build the mesh, bake it, report."""
+def _child(method: str, vertices: int, order: int, rays: int | None) -> None:
+    """Build a knot, bake it, report."""
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
     from meshes import knot
 
     from neural_gash_addon.backend import methods
     from neural_gash_addon.backend.geometry import TriangleMesh
 
+    resource.setrlimit(resource.RLIMIT_AS, (MOST << 30, MOST << 30))
     start = _megabytes("VmRSS")
-    mesh = TriangleMesh.from_triangles(*knot(VERTICES))
+    mesh = TriangleMesh.from_triangles(*knot(vertices))
     built, held = _megabytes("VmHWM"), _megabytes("VmRSS")
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak counts anew from here
-    transfer = methods.run(methods.bake(mesh, order=ORDER, rays=rays))
+    transfer = methods.run(methods.bake(mesh, method, order, rays=rays))
     print(json.dumps({"vertices": len(mesh.points), "seconds": transfer.record.seconds, "built": built - start,
                       "held": held - start, "baked": _megabytes("VmHWM") - start}))
+
+
+def peak(method: str, vertices: int, order: int, rays: int | None) -> dict[str, float] | str:
+    """Vertices, seconds, and MB over the process's start: built, held, baked. Or why there are none."""
+    if not Path("/proc/self/status").exists():
+        return "needs Linux's /proc"
+    try:
+        done = subprocess.run([sys.executable, __file__, method, str(vertices), str(order), str(rays or 0)],
+                              capture_output=True, text=True, check=False, timeout=LONGEST)
+    except subprocess.TimeoutExpired:
+        return f"more than {LONGEST} s"
+    if done.returncode:
+        last = done.stderr.strip().splitlines()[-1:]
+        short = not last or any(word in last[0] for word in ("MemoryError", "allocate", "bad_alloc"))
+        return f"more than {MOST} GB" if short else f"the bake failed: {last[0]}"
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def measure(table: Table, quick: bool) -> None:
@@ -40,14 +60,10 @@ def measure(table: Table, quick: bool) -> None:
     rays = 16 if quick else RAYS
     table.heading("Memory", "Peak resident memory over the process's start (after imports) of building a mesh and "
                             f"of baking it (what the mesh holds included) at order {ORDER}, {rays} rays.")
-    if not Path("/proc/self/status").exists():
-        table.absent("peak memory", "needs Linux's /proc")
+    got = peak("embree", VERTICES, ORDER, rays)
+    if isinstance(got, str):
+        table.absent("peak memory", got)
         return
-    done = subprocess.run([sys.executable, __file__, str(rays)], capture_output=True, text=True, check=False)
-    if done.returncode:
-        table.absent("peak memory", f"the bake failed: {done.stderr.strip().splitlines()[-1:]}")
-        return
-    got = json.loads(done.stdout.splitlines()[-1])
     table.add(f"{got['vertices']} vertices: mesh built from triangles (holds {got['held']:.0f} MB)",
               f"{got['built']:.0f} MB", "", got["built"], 1000, " MB", most=True)
     table.add(f"{got['vertices']} vertices: bake, {got['seconds']:.1f} s", f"{got['baked']:.0f} MB", "",
@@ -55,4 +71,4 @@ def measure(table: Table, quick: bool) -> None:
 
 
 if __name__ == "__main__":
-    _child(int(sys.argv[1]))
+    _child(sys.argv[1], *(int(text) for text in sys.argv[2:4]), int(sys.argv[4]) or None)

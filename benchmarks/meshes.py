@@ -59,5 +59,5 @@ def knot(count: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     following, beside = (i + 1) % along, (j + 1) % around
     p00, p01 = i * around + j, i * around + beside
     p10, p11 = following * around + j, following * around + beside
-    triangles = np.concatenate([np.stack([p00, p01, p11], -1), np.stack([p00, p11, p10], -1)]).reshape(-1, 3)
+    triangles = np.concatenate([np.stack([p00, p11, p01], -1), np.stack([p00, p10, p11], -1)]).reshape(-1, 3)
     return positions, triangles.astype(np.int32)

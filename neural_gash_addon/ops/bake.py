@@ -168,7 +168,7 @@ def _tiles(obj: bpy.types.Object) -> Path | None:
     return Path(bpy.utils.extension_path_user(package, path="tiles", create=True)) / name
 
 
-def _bake_refusal(context: bpy.types.Context) -> str:
+def bake_refusal(context: bpy.types.Context) -> str:
     """Why no bake can begin now; '' where one can."""
     if state.running:
         return "A bake is running; press Esc to cancel it."
@@ -188,7 +188,7 @@ class NEURAL_GASH_OT_bake(Baking, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Not while another bake runs, nor for what cannot be baked."""
-        reason = _bake_refusal(context)
+        reason = bake_refusal(context)
         if reason:
             cls.poll_message_set(reason)
         return not reason
@@ -206,7 +206,7 @@ class NEURAL_GASH_OT_bake_applied_copy(Baking, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """As Bake; and there must be modifiers to apply."""
-        reason = _bake_refusal(context)
+        reason = bake_refusal(context)
         if not reason and not context.object.modifiers:
             reason = f"'{context.object.name}' has no modifiers to apply."
         if reason:

@@ -88,7 +88,7 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
     depsgraph = context.evaluated_depsgraph_get()
     read = read_object(obj, depsgraph)
     method = methods.METHODS[settings.method]
-    mode = _occluder_mode(obj, settings, group) if method.sees else SELF
+    mode = occluder_mode(obj, settings, group) if method.sees else SELF
     quality = {}
     if method.traces:
         by_rays = settings.quality == RAYS
@@ -116,7 +116,7 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
     return Job(obj.session_uid, obj.name, read, bake, mode, before, read.frame, texture, reflection is not None)
 
 
-def _occluder_mode(obj: bpy.types.Object, settings: NeuralGashSettings, group: Sequence[bpy.types.Object]) -> str:
+def occluder_mode(obj: bpy.types.Object, settings: NeuralGashSettings, group: Sequence[bpy.types.Object]) -> str:
     """What shadows the object. Raises UserError where that is not clear."""
     mode = settings.occluder_mode()
     if not mode:

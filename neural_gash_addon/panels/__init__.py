@@ -154,7 +154,25 @@ class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):
         layout.prop(settings, "texture_folder")
 
 
-CLASSES = (NEURAL_GASH_PT_main, NEURAL_GASH_PT_light, NEURAL_GASH_PT_settings)
+class NEURAL_GASH_PT_compare(_Panel, bpy.types.Panel):
+    """Which method is best here."""
+
+    bl_idname = "NEURAL_GASH_PT_compare"
+    bl_label = "Compare"
+    bl_parent_id = "NEURAL_GASH_PT_main"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        """A button, and where to look afterwards."""
+        if state.running:
+            return
+        self.layout.operator("neural_gash.compare", icon="GRAPH")
+        column = self.layout.column(align=True)
+        column.label(text="Chart: in the Image Editor", icon="INFO")
+        column.label(text="Errors: Solid shading, Color: Attribute", icon="BLANK1")
+
+
+CLASSES = (NEURAL_GASH_PT_main, NEURAL_GASH_PT_light, NEURAL_GASH_PT_settings, NEURAL_GASH_PT_compare)
 
 
 def register() -> None:

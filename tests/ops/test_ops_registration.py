@@ -116,6 +116,8 @@ def test_panels_draw_in_every_state(make, settings, monkeypatch):
     for occluders in ("SELF", "COLLECTION"):
         settings.occluders = occluders
         assert ("collection" in _draw("settings")) == (occluders == "COLLECTION")
+    assert "neural_gash.compare" in _draw("compare")
     monkeypatch.setattr(state, "running", True)
+    assert not _draw("compare")
     shown = _draw("main")
     assert "neural_gash.bake" not in shown and any("Esc" in text for text in shown)

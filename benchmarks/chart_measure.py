@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What is on the chart, and its measurement: one block of rows for each mesh and sweep, kept as soon as it is done."""
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import time
+from collections.abc import Generator, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ambient import cycles_openness
+from memory import peak
+from meshes import FOLDER, knot, read
+from numpy.typing import NDArray
+from peers import Open3D, Trimesh
+from table import machine
+from textures import surface_of, texels_of
+
+from neural_gash_addon.backend import compare, methods, texture
+from neural_gash_addon.backend import spherical_harmonics as sh
+from neural_gash_addon.backend.compare import Bake, Measurement, Setting
+from neural_gash_addon.backend.errors import UserError
+from neural_gash_addon.backend.exchange import atomic
+from neural_gash_addon.backend.geometry import TriangleMesh
+from neural_gash_addon.backend.progress import scaled
+from neural_gash_addon.backend.record import BakeRecord
+from neural_gash_addon.backend.unwrap import unwrap
+from neural_gash_addon.backend.workers import default_threads
+
+ORDER = 3
+RAYS = (2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
+FEW = (2, 8, 32, 64, 128, 512)   # of the sweeps that only show what one thing changes
+PEER_RAYS = (4, 16, 64, 256)
+SAMPLE = 4096                    # points of a mesh, or all, at which errors are measured
+REFERENCE_SEED, SEED, ROUNDS = 77, 0, 3
+SIDE = 256                       # texels of a texture
+PEERS = {"trimesh": Trimesh, "open3d": Open3D}
+CYCLES = "cycles-ao"
+COLUMNS = ("points", "method", "order", "rays", "threads", "target", "seconds", "least", "most", "ratio", "runs", "srr",
+           "rel_l2", "openness", "relit_mean", "relit_worst", "claimed", "memory_mb", "note")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A mesh, and what is swept on it."""
+
+    mesh: str       # stem of a file of ../shared/meshes/validation, or 'knot' and a number of vertices
+    category: str   # the manifest's, or 'scale'
+    sweep: str      # 'base', 'peers', 'threads', 'orders', 'texture', or 'scale'
+    quick: bool = False
+
+    @property
+    def key(self) -> str:
+        """What the block is known by."""
+        return f"{self.sweep} {self.mesh}"
+
+
+def full_cases() -> list[Case]:
+    """The full run: three meshes of each category, and the knot at four sizes.
+
+    The three are the smallest, the median and the largest; the other sweeps are of the median one.
+    """
+    by_category: dict[str, list[tuple[int, str]]] = {}
+    if (FOLDER / "MANIFEST.csv").is_file():
+        with (FOLDER / "MANIFEST.csv").open(newline="") as file:
+            for row in csv.DictReader(file):
+                path = Path(row["file"])
+                if path.parent.name == "validation":
+                    by_category.setdefault(row["category"], []).append((int(row["verts"]), path.stem))
+    cases = []
+    for category, found in sorted(by_category.items()):
+        ordered = [stem for _, stem in sorted(found)]
+        middle = ordered[len(ordered) // 2]
+        cases += [Case(stem, category, "base") for stem in dict.fromkeys((ordered[0], middle, ordered[-1]))]
+        cases += [Case(middle, category, sweep) for sweep in ("peers", "threads", "orders", "texture")]
+    if not cases:
+        cases = [Case("knot 8800", "procedural", sweep) for sweep in ("base", "peers", "threads", "orders", "texture")]
+    return cases + [Case(f"knot {size}", "scale", "scale") for size in (1_000, 10_000, 100_000, 1_000_000)]
+
+
+def quick_cases() -> list[Case]:
+    """Each sweep on a small knot."""
+    return [Case(f"knot {size}", category, sweep, quick=True) for size, category, sweep in (
+        (400, "procedural", "base"), (1000, "procedural", "base"), (400, "procedural", "peers"),
+        (400, "procedural", "threads"), (400, "procedural", "orders"), (400, "procedural", "texture"),
+        (1000, "scale", "scale"))]
+
+
+def _mesh(name: str) -> TriangleMesh:
+    """The mesh of a case."""
+    if name.startswith("knot "):
+        return TriangleMesh.from_triangles(*knot(int(name.split()[1])))
+    return read(FOLDER / "validation" / f"{name}.ply")
+
+
+def _settings(case: Case, points: int) -> list[Setting]:
+    """What a case measures, each once."""
+    threads = default_threads()
+    rays: tuple[int, ...] = FEW if case.sweep in ("threads", "orders", "texture") else RAYS
+    if case.sweep == "peers":
+        rays = (2, 8, 32, 64, 128)
+    if case.sweep == "scale":  # a million points take as long as there is time for
+        rays = tuple(count for count in RAYS if count * points <= 1.3e8)
+    if case.quick:
+        rays = tuple(count for count in rays if count in (2, 16, 64))
+    found = []
+    for order in ((2, 4, 5) if case.sweep == "orders" else (ORDER,)):
+        found += [*compare.settings_of(order, rays, 1 if case.sweep == "threads" else threads),
+                  compare.baseline(order, 1 if case.sweep == "threads" else threads)]
+    if case.sweep == "peers":
+        samples = PEER_RAYS[:2] if case.quick else PEER_RAYS
+        found += [Setting(peer, ORDER, count, threads=threads) for peer in (*PEERS, CYCLES) for count in samples]
+    return list(dict.fromkeys(found))
+
+
+def _with_peers(mesh: TriangleMesh, ours: Bake) -> Bake:
+    """Peers are baked as their users would, everything that they build included."""
+    def bake(setting: Setting, seed: int) -> Generator[float, None, tuple[NDArray, BakeRecord | None]]:
+        if setting.method in methods.METHODS:
+            return (yield from ours(setting, seed))
+        yield 0.0
+        assert setting.rays is not None
+        try:
+            if setting.method == CYCLES:
+                found = cycles_openness(mesh)(setting.rays, seed)[:, None] * sh.normalisation(0, 0)
+            else:
+                found = PEERS[setting.method](mesh, setting.order).transfer(setting.rays, seed)
+        except (ImportError, OSError) as error:
+            raise UserError(f"not measured: {error}") from error
+        return found, None
+
+    return bake
+
+
+def _warm_peers(settings: Sequence[Setting]) -> None:
+    """Run each peer once on a small knot, so that no time has its import."""
+    bake = _with_peers(_mesh("knot 100"), compare.vertex_bake(_mesh("knot 100")))
+    for name in (*PEERS, CYCLES):
+        with suppress(UserError):
+            methods.run(bake(next(setting for setting in settings if setting.method == name), 0))
+
+
+def measure(case: Case, lights: list[NDArray]) -> Generator[float, None, dict[str, Any]]:
+    """A block: where it was measured, and its rows in the order of COLUMNS."""
+    mesh = _mesh(case.mesh)
+    note = ""
+    bake = compare.vertex_bake(mesh)
+    points = mesh
+    if case.sweep == "texture":
+        surface, side = surface_of(mesh), 64 if case.quick else SIDE
+        began = time.perf_counter()
+        uv = methods.run(unwrap(surface, side=side)).uv
+        note = f"unwrap {time.perf_counter() - began:.2f} s"
+        points = texels_of(surface, uv, side)
+
+        def bake(setting: Setting, seed: int) -> Generator[float, None, tuple[NDArray, BakeRecord | None]]:
+            found = yield from texture.bake(surface, setting.method, setting.order, uv=uv, side=side,
+                                            rays=setting.rays, seed=seed, threads=setting.threads)
+            return np.concatenate(found.coefficients), found.record
+    settings = _settings(case, len(points.points))
+    memory: dict[str, dict[str, float] | str] = {}
+    if case.sweep == "scale":  # first, so that what the machine has no room for is not tried here
+        for name in dict.fromkeys(setting.method for setting in settings):
+            rays = compare.BASELINE_RAYS if methods.METHODS[name].traces else None
+            memory[name] = peak(name, int(case.mesh.split()[1]), ORDER, rays)
+            yield 0.0
+        settings = [setting for setting in settings if not isinstance(memory[setting.method], str)]
+    sees = methods.METHODS["embree"].sees
+    assert sees is not None
+    scene = sees(points, ())
+    rows = compare.sample(len(points.points), 400 if case.quick else SAMPLE, REFERENCE_SEED)
+    orders = sorted({setting.order for setting in settings})
+    out: list[dict[str, Any]] = []
+    for number, order in enumerate(orders):
+        own = [setting for setting in settings if setting.order == order]
+        start, share = number / len(orders), 1 / len(orders)
+        truth = yield from scaled(compare.reference(points, order, rows, seed=REFERENCE_SEED, scene=scene),
+                                   start, 0.3 * share)
+        whole = bake
+        if case.sweep == "peers":
+            whole = _with_peers(mesh, bake)
+            _warm_peers(own)
+        rounds = 1 if case.quick or len(mesh.points) > 500_000 else ROUNDS
+        found = yield from scaled(compare.compare(whole, own, truth, lights, rounds, SEED),
+                                   start + 0.3 * share, 0.7 * share)
+        out += [_row(case, len(points.points), m, note) for m in found]
+        out.append({"points": len(points.points), "method": "reference", "order": order,
+                    "rays": compare.REFERENCE_RAYS, **truth.floor(lights)})
+    for name, got in memory.items():
+        if isinstance(got, str):
+            out.append({"points": len(mesh.points), "method": name, "order": ORDER, "note": got})
+            continue
+        for row in out:
+            if row["method"] == name:
+                row["memory_mb"] = got["baked"]
+    return {"key": case.key, "mesh": case.mesh, "category": case.category, "sweep": case.sweep, **about(),
+            "rows": [[_short(row.get(column)) for column in COLUMNS] for row in out]}
+
+
+def _row(case: Case, points: int, found: Measurement, note: str) -> dict[str, Any]:
+    setting = found.setting
+    figures = {name: getattr(found, name) for name in
+               ("ratio", "srr", "rel_l2", "openness", "relit_mean", "relit_worst", "claimed")}
+    return {"points": points, "method": setting.method, "order": setting.order, "rays": setting.rays,
+            "threads": setting.threads, "target": "texture" if case.sweep == "texture" else "vertices",
+            "seconds": found.median, "least": min(found.seconds, default=None),
+            "most": max(found.seconds, default=None), "runs": len(found.seconds), "note": found.refused or note,
+            **figures}
+
+
+def _short(value: Any) -> Any:
+    """Four digits, and null for what is not a number."""
+    if isinstance(value, float):
+        return float(f"{value:.4g}") if np.isfinite(value) else None
+    return value
+
+
+def about() -> dict[str, Any]:
+    """Where a block comes from."""
+    root = Path(__file__).resolve().parents[1]
+
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=False).stdout.strip()
+
+    changed = "+" if git("status", "--porcelain", "--untracked-files=no") else ""
+    return {"machine": machine(default_threads()), "commit": git("rev-parse", "--short", "HEAD") + changed,
+            "seeds": {"reference": REFERENCE_SEED, "first": SEED}}
+
+
+def load(path: Path) -> list[dict[str, Any]]:
+    """The blocks that are there."""
+    return json.loads(path.read_text())["blocks"] if path.is_file() else []
+
+
+def save(path: Path, blocks: Iterable[dict[str, Any]]) -> None:
+    """Write all blocks, one row a line; nothing is lost where this is interrupted."""
+    parts = []
+    for block in blocks:
+        head = json.dumps({key: value for key, value in block.items() if key != "rows"})
+        parts.append(head[:-1] + ', "rows": [\n' + ",\n".join(json.dumps(row) for row in block["rows"]) + "]}")
+    with atomic(path) as draft:
+        draft.write_text('{"columns": ' + json.dumps(COLUMNS) + ',\n"blocks": [\n' + ",\n".join(parts) + "]}\n")
+
+
+def rows_of(blocks: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """All rows with their block's mesh, category and sweep; numbers that are not there are NaN."""
+    found = []
+    for block in blocks:
+        for values in block["rows"]:
+            row = dict(zip(COLUMNS, values, strict=True))
+            for name in ("seconds", "ratio", "srr", "rel_l2", "openness", "relit_mean", "relit_worst"):
+                row[name] = float("nan") if row[name] is None else row[name]
+            found.append({**row, "mesh": block["mesh"], "category": block["category"], "sweep": block["sweep"]})
+    return found

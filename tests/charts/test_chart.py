@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""`make chart QUICK=1`, all of it: measured, written, drawn, and not measured again."""
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("bpy")
+pytest.importorskip("torch")
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def run(folder, *more):
+    return subprocess.run([sys.executable, ROOT / "benchmarks" / "chart.py", "--quick", "--out", folder, *more],
+                          capture_output=True, text=True, check=True).stdout
+
+
+def test_quick_form(tmp_path):
+    sys.path.insert(0, str(ROOT))
+    from neural_gash_addon.backend.methods import METHODS
+    page = tmp_path / "page.md"
+    marks = "".join(f"<!-- {name} -->\nold\n<!-- end -->\n" for name in ("origin", "summary", "memory"))
+    page.write_text("# Title\n" + marks + "Last words.\n")
+    printed = run(tmp_path, "--page", page)
+    results = json.loads((tmp_path / "results.json").read_text())
+    blocks = {block["key"]: block for block in results["blocks"]}
+    assert {key.split()[0] for key in blocks} == {"base", "peers", "threads", "orders", "texture", "scale"}
+    for block in blocks.values():
+        assert block["commit"] and "embreex" in block["machine"] and block["seeds"]["reference"]
+        rows = [dict(zip(results["columns"], row, strict=True)) for row in block["rows"]]
+        assert set(METHODS) <= {row["method"] for row in rows}
+        for row in rows:
+            if row["method"] == "analytic":
+                assert row["srr"] == pytest.approx(1)
+            if row["method"] == "embree" and row["rays"] == 64:
+                assert row["srr"] < 0.1 and 0.5 < row["claimed"] / row["rel_l2"] < 2 and row["ratio"] == 1
+                assert 0 < row["relit_mean"] <= row["relit_worst"] < 1
+            if row["method"] == "reference":
+                assert row["srr"] < 1e-3
+            if row["seconds"] is None and row["method"] != "reference":
+                assert row["note"].strip()  # why it is not there
+    scale = [dict(zip(results["columns"], row, strict=True)) for row in blocks["scale knot 1000"]["rows"]]
+    if Path("/proc/self/clear_refs").exists():
+        assert all(0 <= row["memory_mb"] < 4000 for row in scale if row["method"] != "reference")
+    for name in ("all", "categories", "scales", "settings", "openness"):
+        assert (tmp_path / f"{name}.png").stat().st_size > 5000
+    text = page.read_text()
+    assert "old" not in text and "| hybrid | 64 |" in text and "| hybrid | 64 |" in printed
+    assert text.startswith("# Title") and text.endswith("Last words.\n")
+    before = (tmp_path / "results.json").read_bytes()
+    assert run(tmp_path).strip()
+    assert (tmp_path / "results.json").read_bytes() == before  # nothing was missing
