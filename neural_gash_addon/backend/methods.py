@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from . import embree_bake, gnn_bake, hybrid_bake, paper_bake
+from . import embree_bake, gnn_bake, hybrid_bake, paper_bake, sparse_bake
 from . import spherical_harmonics as sh
 from .bounce import Reflection
 from .errors import UserError
@@ -63,6 +63,8 @@ METHODS: dict[str, Method] = {m.name: m for m in (
            traces=True, bake=embree_bake.bake, sees=_embree_scene),
     Method("hybrid", "Few rays and network", "Traces few rays, and a small network takes the rest from neighbours: "
            "smooth at once, and exact with many rays", traces=True, bake=hybrid_bake.bake, sees=_embree_scene),
+    Method("sparse", "Ray traced, sparse", "Traces some points, more where shadows change, and reads the others off "
+           "them; for dense meshes", traces=True, bake=sparse_bake.bake, sees=_embree_scene),
     Method("gnn", "Network", "A network reads the surface around each point, with no ray: soft shadows, quickly",
            traces=False, bake=gnn_bake.bake, sees=gnn_bake.voxels_of),
     Method("gnn-paper", "Paper's network (PyTorch)", "The two-stage graph network of Neural-GASh, for comparison: "
