@@ -44,6 +44,7 @@ class BakeRecord:
     uv_map: str = ""                  # whose coordinates the texture has
     bounces: int = 0                  # of diffuse interreflection that were computed
     colours: int = 1                  # transfer is (N, K), or (N, K, 3) where light bounced off colours
+    plan: str = ""                    # why this method, where it was planned
     basis: str = BASIS
     version: str = VERSION
     schema: int = SCHEMA
