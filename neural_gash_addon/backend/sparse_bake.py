@@ -5,7 +5,8 @@ On a dense scan the blocked part varies slowly from vertex to vertex. Points are
 near and face alike (octant of the normal, then a Z-order curve). Every so many of them are traced, then the middle of
 each gap whose ends differ most, until the error is within the tolerance. That error is measured in each round at fresh
 points that were held back, traced twice with rays of their own, so it has everything in it: noise and reconstruction.
-What is not blocked is exact everywhere, as in the other methods.
+What is not blocked is exact everywhere, as in the other methods. Where points are too few for all this, every point is
+traced, as by `embree`.
 """
 from __future__ import annotations
 
@@ -17,7 +18,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from . import embree_bake
 from . import spherical_harmonics as sh
+from .embree_bake import RATE
 from .estimator import MAX_RAYS, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
 from .hybrid import FULL
@@ -30,13 +33,15 @@ from .workers import default_threads
 WINDOW = 8             # samples along the curve that a point is read off
 FIRST_STRIDE = 64      # points from one sample to the next at the beginning, or fewer where points are few
 FEWEST = 4096          # samples at the beginning
+_LEAST_STRIDE = 4      # with less than so many points for each of them, every point is traced
 HELD = 512             # points held back, in each round
 _HELD_RAYS = 64        # of each of their two traces
-_RATE = 1.5            # variance falls as rays**-RATE (scrambled nets, see embree_bake)
-_NOISE = 0.7           # of the tolerance that a sample's own noise may be
+_NOISE = 1.2           # times the tolerance: a sample's own noise, of which the mean over several leaves less than half
 _LEAST_RAYS = 8
+_WORTH = 0.5           # of the rays that a bake of every point takes: with more, that is done instead
 _COVERED = 0.8         # of what the gaps' ends differ, closed in a round
 _TURN = 0.2            # of the extent: how far away a neighbour counts that faces a right angle away
+SOFT = 0.05            # of the mean D of a window: what a sample's weight is bounded by
 _HEIGHT = 8.0          # how much more a distance counts across the surface than along it, squared
 _ROWS = 1 << 13        # reconstructed by one worker at a time
 
@@ -55,18 +60,24 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
         scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
     lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
     coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
-    error: float | None = 0.0
-    traced = probes = 0
-    if len(lit):
+    spent = 0
+    if len(lit) >= _LEAST_STRIDE * FEWEST:
         lit = lit[curve(mesh.points[lit], mesh.normals[lit])]
         with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
             work = _Work(mesh, scene, order, seed, lit, pool, threads)
             error = yield from scaled(work.refine(rays, tolerance), 0, 0.8)
-            yield from scaled(work.fill(coefficients), 0.8, 0.2)
-        traced, probes = len(work.samples) * work.rays, work.probes
-    return Transfer(coefficients, BakeRecord(
-        method="sparse", order=order, points=len(mesh.points), domain=mesh.domain, seed=seed, rays=traced,
-        probe_rays=probes, seconds=time.perf_counter() - began, error_estimate=error, tolerance=tolerance))
+            traced = len(work.samples) * work.rays
+            if error is not None:
+                yield from scaled(work.fill(coefficients), 0.8, 0.2)
+                return Transfer(coefficients, BakeRecord(
+                    method="sparse", order=order, points=len(mesh.points), domain=mesh.domain, seed=seed, rays=traced,
+                    probe_rays=work.probes, seconds=time.perf_counter() - began, error_estimate=error,
+                    tolerance=tolerance))
+        spent = traced + work.probes
+    every = yield from embree_bake.bake(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed,
+                                        threads=threads, scene=scene)
+    return replace(every, record=replace(every.record, method="sparse", probe_rays=every.record.probe_rays + spent,
+                                         seconds=time.perf_counter() - began))
 
 
 def curve(points: NDArray, normals: NDArray) -> NDArray[np.int64]:
@@ -80,7 +91,8 @@ def reconstructed(points: NDArray, normals: NDArray, samples: NDArray, values: N
                   ) -> NDArray[np.float32]:
     """Values (n, K) of some points, each the mean of those of the WINDOW samples nearest to it along the curve.
 
-    A sample weighs 1 / D**2, where D = distance**2 + HEIGHT height**2 + (TURN extent)**2 (1 - cosine of the normals).
+    A sample weighs 1 / (D + SOFT mean D)**2, where D = distance**2 + HEIGHT height**2 + (TURN extent)**2 (1 - cosine of
+    the normals). So a sample, too, takes something of others: that is less noise.
 
     Args:
         points, normals: (N, 3), in the order of the curve. samples: (M,) indices of some, rising.
@@ -96,8 +108,8 @@ def reconstructed(points: NDArray, normals: NDArray, samples: NDArray, values: N
     square = np.einsum("nwx,nwx->nw", away, away)
     square += _HEIGHT * np.square(np.einsum("nwx,nx->nw", away, normal))
     square += (_TURN * extent) ** 2 * np.maximum(1 - np.einsum("nwx,nx->nw", normals[at], normal), 0)
-    square /= np.maximum(square.min(1, keepdims=True), (1e-9 * extent) ** 2 + 1e-300)  # no overflow
-    weight = 1 / np.square(square + 1e-6)
+    square /= np.maximum(square.mean(1, keepdims=True), (1e-9 * extent) ** 2 + 1e-300)  # no overflow
+    weight = 1 / np.square(square + SOFT)
     weight /= weight.sum(1, keepdims=True)
     return np.matmul(weight[:, None].astype(np.float32), values[chosen])[:, 0]
 
@@ -117,7 +129,10 @@ class _Work:
         self.rays, self.probes = 0, 0
 
     def refine(self, rays: int | None, tolerance: float | None) -> Generator[float, None, float | None]:
-        """Add samples until the measured error is within the tolerance; that error."""
+        """Add samples until the measured error is within the tolerance; that error.
+
+        None where every point had better be traced.
+        """
         count = len(self._lit)
         held = yield from self._held(np.arange(count))
         noise = self._noise(*held)  # of _HELD_RAYS, relative
@@ -125,10 +140,12 @@ class _Work:
             self.rays = rays
         else:
             assert tolerance is not None
-            wanted = _HELD_RAYS * (noise / (_NOISE * tolerance)) ** (2 / _RATE) if noise else 0.0
+            wanted = _HELD_RAYS * (noise / (_NOISE * tolerance)) ** (2 / RATE) if noise else 0.0
             self.rays = int(2 ** np.ceil(np.log2(np.clip(wanted, _LEAST_RAYS, MAX_RAYS))))
-        noise *= (_HELD_RAYS / self.rays) ** (_RATE / 2)
-        goal = noise if tolerance is None else tolerance
+        goal = noise * (_HELD_RAYS / self.rays) ** (RATE / 2) if tolerance is None else tolerance
+        if not goal:
+            return None
+        every = count * (self.rays if rays is not None else _HELD_RAYS * (noise / goal) ** (2 / RATE))
         stride = max(1, min(FIRST_STRIDE, count // FEWEST))
         fresh = np.unique(np.append(np.arange(0, count, stride), count - 1))
         left = 1.0
@@ -137,16 +154,13 @@ class _Work:
             left /= 2
             apart = np.ones(count, bool)
             apart[self.samples] = False
-            others = np.flatnonzero(apart)
-            if not len(others):
-                return noise
-            held = yield from scaled(self._held(others), 1 - left, 0)
+            held = yield from scaled(self._held(np.flatnonzero(apart)), 1 - left, 0)
             error = self._error(*held)
-            share = len(others) / count
-            error = None if error is None else float(share * error ** 2 + (1 - share) * noise ** 2) ** 0.5
             if error is None or error <= goal:
                 return error
             fresh = self._to_close()
+            if self.rays * (len(self.samples) + len(fresh)) > _WORTH * max(every, count):
+                return None
 
     def fill(self, coefficients: NDArray[np.float32]) -> Generator[float, None, None]:
         """Transfer (N, K) of all points that have a normal."""
@@ -163,11 +177,8 @@ class _Work:
             yield (number + 1) / len(starts)
 
     def _at(self, rows: NDArray, unshadowed: NDArray) -> NDArray[np.float32]:
-        """Blocked part (n, K) at some points: as traced where it was, else reconstructed."""
+        """Blocked part (n, K) at some points, reconstructed."""
         values = reconstructed(self._mesh.points, self._mesh.normals, self.samples, self._values, rows, self._extent)
-        place = np.minimum(np.searchsorted(self.samples, rows), len(self.samples) - 1)
-        known = self.samples[place] == rows
-        values[known] = self._values[place[known]]
         return _levelled(values, unshadowed, 1)
 
     def _sample(self, fresh: NDArray) -> Generator[float, None, None]:
