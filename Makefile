@@ -3,8 +3,9 @@
 # make test   run the tests
 # make test-window BLENDER=…   try the panel and the bake in an open Blender (see tests/window/session.py)
 # make data    label meshes to train on, in training/cache/ (COUNT=2000 SEED=1 FOLDER=… for more)
+# make planner  what the planner picks, beside the cheapest plan that meets the tolerance
 # make lint, package, bench, docs-pictures, clean: as they say
-.PHONY: data demo docs-pictures test test-window lint package bench clean system-packages
+.PHONY: data demo docs-pictures test test-window lint package bench planner clean system-packages
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 PY := .venv/bin/python
 # Debian's names of what bpy loads; EEVEE renders without a display through EGL and llvmpipe
@@ -47,6 +48,10 @@ package: .venv/ready
 bench: .venv/ready
 	$(PY) -m pip install --disable-pip-version-check -q -r benchmarks/requirements.txt
 	$(PY) benchmarks/bench.py
+
+planner: .venv/ready
+	$(PY) -m pip install --disable-pip-version-check -q -r benchmarks/requirements.txt
+	$(PY) benchmarks/planner.py
 
 COUNT ?= 2000
 SEED ?= 1
