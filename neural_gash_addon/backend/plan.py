@@ -27,7 +27,8 @@ from .estimator import MAX_RAYS, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
 from .raycast import Geometry, Occluders
 
-PILOT_POINTS = 256
+PILOT_POINTS = 256           # or a 32nd of them all, if that is less, but at least
+_FEWEST = 96
 PILOT_RAYS = 64              # of each of two traces
 _PILOT_SETS = 4
 _SAFE = 1.2                  # what the pilot's estimates may be too low by
@@ -104,7 +105,7 @@ def pilot(mesh: TriangleMesh, scene: Occluders, order: int, seed: int, pool: Thr
     """Trace a few points well. Yields progress."""
     lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
     rng = np.random.default_rng([seed, 5])
-    rows = np.sort(rng.choice(lit, min(PILOT_POINTS, len(lit)), replace=False))
+    rows = np.sort(rng.choice(lit, min(max(min(PILOT_POINTS, len(lit) // 32), _FEWEST), len(lit)), replace=False))
     few = replace(mesh, points=mesh.points[rows], normals=mesh.normals[rows], clearance=mesh.clearance[rows])
     unshadowed = sh.cosine_lobe(few.normals, order)
     every, found = np.arange(len(rows)), []
