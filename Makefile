@@ -4,10 +4,11 @@
 # make test-window BLENDER=…   try the panel and the bake in an open Blender (see tests/window/session.py)
 # make data    label meshes to train on, in training/cache/ (COUNT=2000 SEED=1 FOLDER=… for more)
 # make chart  error against time of every method, in docs/chart (QUICK=1: a small one, in out/chart)
+# make planner  what the planner picks, beside the cheapest plan that meets the tolerance
 # make stability  where methods fail: a table, in docs/stability.md (QUICK=1: a small one, printed)
-# make lint, package, bench, docs-pictures, clean: as they say
 # make train NETWORK=gnn   label meshes and train from nothing: gnn, hybrid, gnn-paper, mlp, end-to-end or student
-.PHONY: chart data train demo docs-pictures stability test test-window lint package bench clean system-packages
+# make lint, package, bench, docs-pictures, clean: as they say
+.PHONY: chart data train demo docs-pictures planner stability test test-window lint package bench clean system-packages
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 PY := .venv/bin/python
 # Debian's names of what bpy loads; EEVEE renders without a display through EGL and llvmpipe
@@ -57,6 +58,10 @@ chart: .venv/ready
 
 stability: .venv/ready
 	$(PY) benchmarks/stability.py $(if $(QUICK),--quick,--out docs/stability.json --page docs/stability.md)
+
+planner: .venv/ready
+	$(PY) -m pip install --disable-pip-version-check -q -r benchmarks/requirements.txt
+	$(PY) benchmarks/planner.py
 
 COUNT ?= 2000
 SEED ?= 1

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from . import embree_bake, gnn_bake, hybrid_bake, paper_bake
+from . import auto_bake, embree_bake, gnn_bake, hybrid_bake, paper_bake, sparse_bake
 from . import spherical_harmonics as sh
 from .bounce import Reflection
 from .errors import UserError
@@ -56,13 +56,22 @@ def _embree_scene(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> Occluder
     return Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
 
 
+def _auto(mesh: TriangleMesh, order: int, **arguments: Any) -> Baking:
+    return auto_bake.bake(mesh, order, **arguments, bakers={name: METHODS[name].bake for name in
+                                                            ("analytic", "embree", "hybrid", "sparse")})
+
+
 METHODS: dict[str, Method] = {m.name: m for m in (
     Method("analytic", "Unshadowed", "Exact shading of the normals alone, without any shadows; instant",
            traces=False, bake=_analytic),
     Method("embree", "Ray traced", "Traces rays with Embree to find what blocks the light; the reference",
            traces=True, bake=embree_bake.bake, sees=_embree_scene),
+    Method("auto", "Automatic", "Looks at a few points, and takes the cheapest method that meets the tolerance",
+           traces=True, bake=_auto, sees=_embree_scene),
     Method("hybrid", "Few rays and network", "Traces few rays, and a small network takes the rest from neighbours: "
            "smooth at once, and exact with many rays", traces=True, bake=hybrid_bake.bake, sees=_embree_scene),
+    Method("sparse", "Ray traced, sparse", "Traces some points, more where shadows change, and reads the others off "
+           "them; for dense meshes", traces=True, bake=sparse_bake.bake, sees=_embree_scene),
     Method("gnn", "Network", "A network reads the surface around each point, with no ray: soft shadows, quickly",
            traces=False, bake=gnn_bake.bake, sees=gnn_bake.voxels_of),
     Method("gnn-paper", "Paper's network (PyTorch)", "The two-stage graph network of Neural-GASh, for comparison: "

@@ -45,6 +45,7 @@ class BakeRecord:
     single_faces: int = 0             # that lie alone in it, as xatlas could not chart them with their neighbours
     bounces: int = 0                  # of diffuse interreflection that were computed
     colours: int = 1                  # transfer is (N, K), or (N, K, 3) where light bounced off colours
+    plan: str = ""                    # why this method, where it was planned
     basis: str = BASIS
     version: str = VERSION
     schema: int = SCHEMA

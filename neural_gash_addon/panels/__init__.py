@@ -72,6 +72,9 @@ class NEURAL_GASH_PT_main(_Panel, bpy.types.Panel):
         label = METHODS[record.method].label if record.method in METHODS else record.method
         column = box.column(align=True)
         column.label(text=f"{label}, order {record.order}, {record.points:,} points")
+        for sentence in record.plan.split(": "):
+            if sentence:
+                column.label(text=sentence)
         if record.side:
             column.label(text=f"Texture: {record.side} x {record.side}, UV map {record.uv_map}")
         if record.bounces:

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The planner's regret: time of its plan over that of the cheapest candidate that meets the tolerance; `make planner`.
+
+Every candidate is run on every mesh of ../shared/meshes/validation (or --folder), on one thread, and timed by the
+processor, which other work on the machine disturbs least: unshadowed, plain bakes of 4 to 32 rays, and the three
+methods that measure (ray traced, hybrid, sparse) to the tolerance. A candidate meets it whose error against a reference
+of its own (at most 2,000 of the points) is no more. The planner's own time has everything in it, its pilot and
+its looks for what blocks.
+"""
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import numpy as np
+from meshes import FOLDER, read
+from numpy.typing import NDArray
+
+from neural_gash_addon.backend import methods, metrics
+from neural_gash_addon.backend.geometry import TriangleMesh
+from neural_gash_addon.backend.transfer import Transfer
+
+TOLERANCES = (0.2, 0.1, 0.05, 0.02, 0.01)
+ORDER, REFERENCE_RAYS, POINTS = 3, 1024, 2000
+FIXED: list[tuple[str, dict]] = [("analytic", {}), *(("embree", {"rays": rays}) for rays in (4, 8, 16, 32))]
+MEASURING = ("embree", "hybrid", "sparse")
+
+
+def timed(mesh: TriangleMesh, rows: NDArray, truth: NDArray, method: str, repeats: int, **wish: float
+          ) -> tuple[float, float, Transfer]:
+    """Processor seconds (the least of some runs), true error and outcome of a bake."""
+    times = []
+    for _ in range(repeats):
+        began = time.process_time()
+        found = methods.run(methods.bake(mesh, method, ORDER, threads=1, **wish))
+        times.append(time.process_time() - began)
+    return min(times), metrics.rel_l2(found.coefficients[rows], truth), found
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--folder", type=Path, default=FOLDER / "validation")
+    parser.add_argument("--only", nargs="*", default=[""], help="files whose name has one of these in it")
+    parser.add_argument("--repeats", type=int, default=3)
+    arguments = parser.parse_args()
+    print(f"Order {ORDER}, one thread, processor seconds.\n\n| mesh | vertices | tolerance | plan | s | error | "
+          "cheapest | s | regret |\n|---|---|---|---|---|---|---|---|---|", flush=True)
+    regrets: dict[float, list[float]] = {tolerance: [] for tolerance in TOLERANCES}
+    misses: list[float] = []
+    for path in sorted(p for p in arguments.folder.glob("*.ply") if any(o in p.stem for o in arguments.only)):
+        mesh = read(path)
+        rows = np.random.default_rng(5).choice(len(mesh.points), min(POINTS, len(mesh.points)), replace=False)
+        few = replace(mesh, points=mesh.points[rows], normals=mesh.normals[rows], clearance=mesh.clearance[rows])
+        truth = methods.run(methods.bake(few, "embree", ORDER, rays=REFERENCE_RAYS, seed=99)).coefficients
+        fixed = [(" ".join([name, *map(str, wish.values())]),
+                  *timed(mesh, rows, truth, name, arguments.repeats, **wish)[:2]) for name, wish in FIXED]
+        for tolerance in TOLERANCES:
+            tried = fixed + [(name, *timed(mesh, rows, truth, name, arguments.repeats, tolerance=tolerance)[:2])
+                             for name in MEASURING]
+            spent, error, found = timed(mesh, rows, truth, "auto", arguments.repeats, tolerance=tolerance)
+            misses.append(error / tolerance)
+            met = [(seconds, name) for name, seconds, wrong in tried if wrong <= tolerance]
+            least, name = min(met) if met else (float("nan"), "none")
+            regrets[tolerance].append(spent / least)
+            plan = found.record.method + (f" {found.record.rays_per_point:.0f}" if found.record.rays else "")
+            print(f"| {path.stem} | {len(mesh.points):,} | {tolerance:.0%} | {plan} | {spent:.3f} | {error:.2%} | "
+                  f"{name} | {least:.3f} | {regrets[tolerance][-1]:.2f} |", flush=True)
+    print("\n| tolerance | cases | median regret | 90th percentile |\n|---|---|---|---|")
+    for label, values in [*((f"{t:.0%}", r) for t, r in regrets.items()), ("all", sum(regrets.values(), []))]:
+        known = np.array(values)[np.isfinite(values)]
+        if len(known):
+            print(f"| {label} | {len(known)} | {np.median(known):.2f} | {np.percentile(known, 90):.2f} |")
+    missed = [m for m in misses if m > 1]
+    print(f"\nTolerance missed in {len(missed)} of {len(misses)} cases ({len(missed) / max(len(misses), 1):.0%}), at "
+          f"worst {max(misses, default=0):.2f} times.")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The sparse bake: the blocked part is traced at some points, and read off those at the others (`sparse`).
+
+On a dense scan the blocked part varies slowly from vertex to vertex. Points are put in an order in which neighbours are
+near and face alike (octant of the normal, then a Z-order curve). Every so many of them are traced, then the middle of
+each gap whose ends differ most, until the error is within the tolerance. That error is measured in each round at fresh
+points that were held back, traced twice with rays of their own, so it has everything in it: noise and reconstruction.
+What is not blocked is exact everywhere, as in the other methods. Where points are too few for all this, every point is
+traced, as by `embree`.
+"""
+from __future__ import annotations
+
+import time
+from collections.abc import Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import embree_bake
+from . import spherical_harmonics as sh
+from .embree_bake import RATE
+from .estimator import MAX_RAYS, BlockedEstimator, morton_order
+from .geometry import TriangleMesh
+from .hybrid import FULL
+from .progress import scaled
+from .raycast import Geometry, Occluders
+from .record import BakeRecord
+from .transfer import Transfer
+from .workers import default_threads
+
+WINDOW = 8             # samples along the curve that a point is read off
+FIRST_STRIDE = 64      # points from one sample to the next at the beginning, or fewer where points are few
+FEWEST = 4096          # samples at the beginning
+_LEAST_STRIDE = 4      # with less than so many points for each of them, every point is traced
+HELD = 512             # points held back, in each round
+_HELD_RAYS = 64        # of each of their two traces
+_NOISE = 1.2           # times the tolerance: a sample's own noise, of which the mean over several leaves less than half
+_LEAST_RAYS = 8
+_WORTH = 0.5           # of the rays that a bake of every point takes: with more, that is done instead
+_COVERED = 0.8         # of what the gaps' ends differ, closed in a round
+_TURN = 0.2            # of the extent: how far away a neighbour counts that faces a right angle away
+SOFT = 0.05            # of the mean D of a window: what a sample's weight is bounded by
+_HEIGHT = 8.0          # how much more a distance counts across the surface than along it, squared
+_ROWS = 1 << 13        # reconstructed by one worker at a time
+
+
+def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
+         occluders: Sequence[Geometry], seed: int, threads: int | None, scene: Occluders | None = None,
+         ) -> Generator[float, None, Transfer]:
+    """Trace some points of `mesh`, and reconstruct the rest; arguments as `methods.bake`.
+
+    With a number of rays, the samples take so many each, and are as many as it takes for the whole to be as exact as
+    if every point had been traced with them.
+    """
+    began = time.perf_counter()
+    threads = threads or default_threads()
+    if scene is None:
+        scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
+    lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+    coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
+    spent = 0
+    if len(lit) >= _LEAST_STRIDE * FEWEST:
+        lit = lit[curve(mesh.points[lit], mesh.normals[lit])]
+        with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+            work = _Work(mesh, scene, order, seed, lit, pool, threads)
+            error = yield from scaled(work.refine(rays, tolerance), 0, 0.8)
+            traced = len(work.samples) * work.rays
+            if error is not None:
+                yield from scaled(work.fill(coefficients), 0.8, 0.2)
+                return Transfer(coefficients, BakeRecord(
+                    method="sparse", order=order, points=len(mesh.points), domain=mesh.domain, seed=seed, rays=traced,
+                    probe_rays=work.probes, seconds=time.perf_counter() - began, error_estimate=error,
+                    tolerance=tolerance))
+        spent = traced + work.probes
+    every = yield from embree_bake.bake(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed,
+                                        threads=threads, scene=scene)
+    return replace(every, record=replace(every.record, method="sparse", probe_rays=every.record.probe_rays + spent,
+                                         seconds=time.perf_counter() - began))
+
+
+def curve(points: NDArray, normals: NDArray) -> NDArray[np.int64]:
+    """An order (N,) of points (N, 3) in which neighbours are near and have normals (N, 3) of one octant."""
+    order = morton_order(points)
+    octant = ((normals > 0) @ np.array([1, 2, 4])).astype(np.uint8)
+    return order[np.argsort(octant[order], kind="stable")]
+
+
+def reconstructed(points: NDArray, normals: NDArray, samples: NDArray, values: NDArray, wanted: NDArray, extent: float
+                  ) -> NDArray[np.float32]:
+    """Values (n, K) of some points, each the mean of those of the WINDOW samples nearest to it along the curve.
+
+    A sample weighs 1 / (D + SOFT mean D)**2, where D = distance**2 + HEIGHT height**2 + (TURN extent)**2 (1 - cosine of
+    the normals). So a sample, too, takes something of others: that is less noise.
+
+    Args:
+        points, normals: (N, 3), in the order of the curve. samples: (M,) indices of some, rising.
+        values: (M, K) at them. wanted: (n,) indices.
+        extent: of what is baked, metres.
+    """
+    width = min(WINDOW, len(samples))
+    first = np.clip(np.searchsorted(samples, wanted) - width // 2, 0, len(samples) - width)
+    chosen = first[:, None] + np.arange(width)
+    at = samples[chosen]
+    away = points[at] - points[wanted, None]
+    normal = normals[wanted]
+    square = np.einsum("nwx,nwx->nw", away, away)
+    square += _HEIGHT * np.square(np.einsum("nwx,nx->nw", away, normal))
+    square += (_TURN * extent) ** 2 * np.maximum(1 - np.einsum("nwx,nx->nw", normals[at], normal), 0)
+    square /= np.maximum(square.mean(1, keepdims=True), (1e-9 * extent) ** 2 + 1e-300)  # no overflow
+    weight = 1 / np.square(square + SOFT)
+    weight /= weight.sum(1, keepdims=True)
+    return np.matmul(weight[:, None].astype(np.float32), values[chosen])[:, 0]
+
+
+class _Work:
+    """The samples of one bake; points are counted along the curve."""
+
+    def __init__(self, mesh: TriangleMesh, scene: Occluders, order: int, seed: int, lit: NDArray,
+                 pool: ThreadPoolExecutor, threads: int) -> None:
+        self._scene, self._order, self._pool, self._threads = scene, order, pool, threads
+        self._mesh = replace(mesh, points=mesh.points[lit], normals=mesh.normals[lit], clearance=mesh.clearance[lit])
+        self._lit = lit
+        self._extent = 1.0 / scene.scale
+        self._rng = np.random.default_rng([seed, 4])
+        self.samples = np.zeros(0, np.int64)
+        self._values = np.zeros((0, sh.coefficient_count(order)), np.float32)  # blocked part, see `_levelled`
+        self.rays, self.probes = 0, 0
+
+    def refine(self, rays: int | None, tolerance: float | None) -> Generator[float, None, float | None]:
+        """Add samples until the measured error is within the tolerance; that error.
+
+        None where every point had better be traced.
+        """
+        count = len(self._lit)
+        held = yield from self._held(np.arange(count))
+        noise = self._noise(*held)  # of _HELD_RAYS, relative
+        if rays is not None:
+            self.rays = rays
+        else:
+            assert tolerance is not None
+            wanted = _HELD_RAYS * (noise / (_NOISE * tolerance)) ** (2 / RATE) if noise else 0.0
+            self.rays = int(2 ** np.ceil(np.log2(np.clip(wanted, _LEAST_RAYS, MAX_RAYS))))
+        goal = noise * (_HELD_RAYS / self.rays) ** (RATE / 2) if tolerance is None else tolerance
+        if not goal:
+            return None
+        every = count * (self.rays if rays is not None else _HELD_RAYS * (noise / goal) ** (2 / RATE))
+        stride = max(1, min(FIRST_STRIDE, count // FEWEST))
+        fresh = np.unique(np.append(np.arange(0, count, stride), count - 1))
+        left = 1.0
+        while True:
+            yield from scaled(self._sample(fresh), 1 - left, left / 2)
+            left /= 2
+            apart = np.ones(count, bool)
+            apart[self.samples] = False
+            held = yield from scaled(self._held(np.flatnonzero(apart)), 1 - left, 0)
+            error = self._error(*held)
+            if error is None or error <= goal:
+                return error
+            fresh = self._to_close()
+            if self.rays * (len(self.samples) + len(fresh)) > _WORTH * max(every, count):
+                return None
+
+    def fill(self, coefficients: NDArray[np.float32]) -> Generator[float, None, None]:
+        """Transfer (N, K) of all points that have a normal."""
+        count = len(self._lit)
+
+        def part(start: int) -> None:
+            rows = np.arange(start, min(start + _ROWS, count))
+            unshadowed = sh.cosine_lobe(self._mesh.normals[rows], self._order).astype(np.float32)
+            blocked = self._at(rows, unshadowed)
+            coefficients[self._lit[rows]] = unshadowed - blocked
+
+        starts = range(0, count, _ROWS)
+        for number, _ in enumerate(self._pool.map(part, starts)):
+            yield (number + 1) / len(starts)
+
+    def _at(self, rows: NDArray, unshadowed: NDArray) -> NDArray[np.float32]:
+        """Blocked part (n, K) at some points, reconstructed."""
+        values = reconstructed(self._mesh.points, self._mesh.normals, self.samples, self._values, rows, self._extent)
+        return _levelled(values, unshadowed, 1)
+
+    def _sample(self, fresh: NDArray) -> Generator[float, None, None]:
+        """Trace some points and add them to the samples."""
+        blocked = yield from self._traced(fresh, self.rays)
+        values = _levelled(blocked.astype(np.float32), sh.cosine_lobe(self._mesh.normals[fresh], self._order), -1)
+        samples = np.concatenate([self.samples, fresh])
+        order = np.argsort(samples, kind="stable")
+        self.samples, self._values = samples[order], np.concatenate([self._values, values])[order]
+
+    def _to_close(self) -> NDArray[np.int64]:
+        """The middles of the gaps between samples whose ends differ most, times the points between."""
+        length = np.diff(self.samples)
+        gap = np.flatnonzero(length > 1)
+        differ = np.square(self._values[gap + 1] - self._values[gap]).sum(1, dtype=np.float64) * (length[gap] - 1)
+        rank = np.argsort(-differ, kind="stable")
+        total = np.cumsum(differ[rank])
+        most = max(int(np.searchsorted(total, _COVERED * total[-1])) + 1, len(gap) // 8 + 1)
+        chosen = np.sort(gap[rank[:most]])
+        return self.samples[chosen] + length[chosen] // 2
+
+    def _held(self, among: NDArray) -> Generator[float, None, tuple[NDArray, NDArray, NDArray]]:
+        """Some points (h,), and two independent traces (h, K) of their blocked part."""
+        points = np.sort(self._rng.choice(among, min(HELD, len(among)), replace=False))
+        one = yield from self._traced(points, _HELD_RAYS)
+        two = yield from self._traced(points, _HELD_RAYS)
+        self.probes += 2 * _HELD_RAYS * len(points)
+        return points, one, two
+
+    def _error(self, points: NDArray, one: NDArray, two: NDArray) -> float | None:
+        """Relative L2 error at points held back. Both traces' noise is independent, so it cancels in the product."""
+        unshadowed = sh.cosine_lobe(self._mesh.normals[points], self._order)
+        blocked = self._at(points, unshadowed)
+        energy = float(((unshadowed - one) * (unshadowed - two)).sum())
+        squared = float(((blocked - one) * (blocked - two)).sum())
+        return (max(squared, 0.0) / energy) ** 0.5 if energy > 0 else None
+
+    def _noise(self, points: NDArray, one: NDArray, two: NDArray) -> float:
+        """Relative error of one of two traces, from how they differ."""
+        unshadowed = sh.cosine_lobe(self._mesh.normals[points], self._order)
+        energy = float(((unshadowed - one) * (unshadowed - two)).sum())
+        return (float(np.square(one - two).sum()) / 2 / energy) ** 0.5 if energy > 0 else 0.0
+
+    def _traced(self, points: NDArray, rays: int) -> Generator[float, None, NDArray]:
+        """The blocked part (n, K) at some points, with rays of their own."""
+        few = replace(self._mesh, points=self._mesh.points[points], normals=self._mesh.normals[points],
+                      clearance=self._mesh.clearance[points])
+        estimator = BlockedEstimator(few, self._scene, self._order, int(self._rng.integers(2**31)), rays)
+        rows = np.arange(len(points))
+        sums = np.zeros((len(points), sh.coefficient_count(self._order)))
+        yield from estimator.trace(self._pool, self._threads, rows, 0, rays, sums)
+        return estimator.turned(self._pool, rows, estimator.means(rows, sums, 0, rays)).astype(np.float64)
+
+
+def _levelled(blocked: NDArray, unshadowed: NDArray, sign: int) -> NDArray[np.float32]:
+    """Blocked part (n, K) less (sign -1) or plus (1) what it would be if as much of the sky were blocked evenly.
+
+    A neighbour that faces another way is so read as it would be here (as in `hybrid.filtered`).
+    """
+    out = np.array(blocked, np.float32)
+    out[:, 1:] += sign * blocked[:, :1] * unshadowed[:, 1:] / np.float32(FULL)
+    return out
