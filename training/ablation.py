@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Does the conformal encoding help? The paper's networks, trained alike on four encodings, three seeds each.
 
-`python -m training.ablation --network mlp` (and `--network gnn-paper`): logs go to logs/ablation, and are drawn to
-docs/. What is there is not trained again. The same meshes, patches, turns and steps for all; only the numbers that
+`python -m training.ablation --network mlp` (and `--network visibility`, stage 1 of the paper's network, in which its
+shadows are learned): logs go to logs/ablation, and are drawn to docs/. What is there is not trained again. The same meshes, patches, turns and steps for all; only the numbers that
 the first layer reads differ, and its width with them.
 """
 from __future__ import annotations
@@ -18,7 +18,9 @@ from . import data, paper
 
 LOGS = Path(__file__).parent / "logs" / "ablation"
 SEEDS = (0, 1, 2)
-STEPS = {"mlp": 1500, "gnn-paper": 400}
+STEPS = {"mlp": 1000, "visibility": 400}
+ERRORS = {"mlp": ("srr_median", "SRR of held-out meshes, median"),
+          "visibility": ("misjudged", "rays of held-out meshes misjudged, balanced")}
 MESHES = 200
 
 
@@ -43,10 +45,10 @@ def draw(network: str, path: Path) -> None:
 
     figure, axes = pyplot.subplots(figsize=(7, 4.5), layout="constrained")
     for encoding in paper.ENCODINGS:
-        steps, found = curves_of(network, encoding, "srr_median")
+        steps, found = curves_of(network, encoding, ERRORS[network][0])
         line, = axes.plot(steps, found.mean(0), label=f"{encoding} ({paper.ENCODINGS[encoding][0]})")
         axes.fill_between(steps, found.min(0), found.max(0), color=line.get_color(), alpha=0.15)
-    axes.set(xlabel="step", ylabel="SRR of held-out meshes, median", title=f"{network}: encodings, {len(SEEDS)} seeds")
+    axes.set(xlabel="step", ylabel=ERRORS[network][1], title=f"{network}: encodings, {len(SEEDS)} seeds")
     axes.grid(alpha=0.3)
     axes.legend()
     figure.savefig(path, dpi=110)
@@ -54,16 +56,13 @@ def draw(network: str, path: Path) -> None:
 
 
 def table(network: str) -> str:
-    """Markdown: final errors, means and spreads over seeds."""
-    lines = ["| encoding | numbers | SRR, median mesh | spread over seeds | SRR, mean | spread | visibility accuracy |",
-             "|---|---|---|---|---|---|---|"]
+    """Markdown: error at the end, its mean over seeds and its spread, from the least to the greatest."""
+    column, what = ERRORS[network]
+    lines = [f"| {network}, {STEPS[network]} steps | numbers | {what} | spread over seeds | training loss |",
+             "|---|---|---|---|---|"]
     for encoding, (width, _) in paper.ENCODINGS.items():
-        cells = []
-        for column in ("srr_median", "srr_mean"):
-            last = curves_of(network, encoding, column)[1][:, -1]
-            cells += [f"{last.mean():.3f}", f"{np.ptp(last):.3f}"]
-        seen = f"{curves_of(network, encoding, 'accuracy')[1][:, -1].mean():.3f}" if network == "gnn-paper" else ""
-        lines.append(f"| {encoding} | {width} | {' | '.join(cells)} | {seen} |")
+        last, loss = (curves_of(network, encoding, name)[1][:, -1] for name in (column, "loss"))
+        lines.append(f"| {encoding} | {width} | {last.mean():.4f} | {np.ptp(last):.4f} | {loss.mean():.4f} |")
     return "\n".join(lines)
 
 

@@ -35,7 +35,8 @@ ENCODINGS: dict[str, tuple[int, Callable[[np.ndarray, np.ndarray], np.ndarray]]]
     "plain": (6, lambda points, normals: np.concatenate([points, normals], 1)),
 }
 NETWORKS: dict[str, Callable[[int], nn.Module]] = {
-    "mlp": paper.Mlp, "gnn-paper": paper.TwoStage, "end-to-end": paper.CoefficientsNet, "student": paper.Mlp}
+    "mlp": paper.Mlp, "gnn-paper": paper.TwoStage, "end-to-end": paper.CoefficientsNet, "student": paper.Mlp,
+    "visibility": paper.VisibilityNet}
 SHIPPED = ("mlp", "gnn-paper")
 Model = TypeVar("Model", bound=nn.Module)
 STEPS = {"mlp": 3000, "student": 3000, "gnn-paper": 4000, "end-to-end": 2000}
@@ -184,16 +185,20 @@ def train(network: str, encoding: str, seed: int, kept: list[Source], held: list
                         checkpoint=checkpoint.with_name(checkpoint.name + stage),
                         log=log.with_name(f"{log.stem}{stage}.csv"))
 
-    torch.manual_seed(seed)
-    model = NETWORKS[network](ENCODINGS[encoding][0]).to(loop.device())
-    if isinstance(model, paper.TwoStage):
+    def fit_stage_1(model: Model, steps: int, stage: str = "") -> Model:
         def seen(model: nn.Module, rng: np.random.Generator) -> Tensor:
             example = drawn(rng, traced=True)
             logits = model(example.encoded, example.source, example.start)
             return balanced(logits[example.inner], example.visibility[example.inner], example.free)
 
-        model.visibility = fit(model.visibility, seen, lambda model: misjudged(model, held, encoding), 2 * steps,
-                               "-visibility")
+        return fit(model, seen, lambda model: misjudged(model, held, encoding), steps, stage)
+
+    torch.manual_seed(seed)
+    model = NETWORKS[network](ENCODINGS[encoding][0]).to(loop.device())
+    if isinstance(model, paper.VisibilityNet):
+        return fit_stage_1(model, steps)
+    if isinstance(model, paper.TwoStage):
+        model.visibility = fit_stage_1(model.visibility, 2 * steps, "-visibility")
         model.visibility.requires_grad_(False)
     return fit(model, lambda model, rng: loss_of(model, drawn(rng, traced=False), teacher),
                lambda model: evaluate(model, held, encoding), steps)
@@ -207,7 +212,7 @@ def sources(cache: Path, most: int) -> list[list[Source]]:
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--network", choices=list(NETWORKS), default="gnn-paper")
+    parser.add_argument("--network", choices=list(STEPS), default="gnn-paper")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int)
     parser.add_argument("--meshes", type=int, default=600, help="at most, of the cache")
