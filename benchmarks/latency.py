@@ -21,7 +21,7 @@ from memory import _megabytes
 from meshes import knot
 from table import machine
 
-from neural_gash_addon.backend import cones, conformal, gnn, gnn_bake, methods, paper_bake, refine, weights
+from neural_gash_addon.backend import cones, gnn, gnn_bake, methods, paper_bake, refine, weights
 from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.geometry import TriangleMesh
 from neural_gash_addon.backend.graph import graph
@@ -71,7 +71,7 @@ def paper_stages(mesh: TriangleMesh) -> dict[str, float]:
 
     clock, network = Clock(), paper.TwoStage()
     edges = clock("graph", lambda: graph(mesh.points, neighbours(mesh)))
-    encoded = clock("encode", lambda: conformal.encode(paper_bake.placed(mesh.points), mesh.normals).astype(np.float32))
+    encoded = clock("encode", lambda: paper_bake.encoded(mesh))
     x, source, start = (torch.from_numpy(a) for a in (encoded, edges.source, edges.start))
     network.eval()
     with torch.no_grad():

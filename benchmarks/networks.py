@@ -51,9 +51,9 @@ def visibility_accuracy(mesh: TriangleMesh) -> float:
     network.load_state_dict({name: torch.from_numpy(array.copy()) for name, array
                              in weights.load(weights.FOLDER / "gnn-paper.safetensors").items()})
     edges = graph(mesh.points, neighbours(mesh))
-    encoded = conformal.encode(paper_bake.placed(mesh.points), mesh.normals).astype(np.float32)
     with torch.no_grad():
-        logits = network.eval().visibility(*(torch.from_numpy(a) for a in (encoded, edges.source, edges.start)))
+        logits = network.eval().visibility(*(torch.from_numpy(a) for a in (paper_bake.encoded(mesh), edges.source,
+                                                                           edges.start)))
     scene = Occluders([(mesh.positions, mesh.triangles)], mesh.resolution)
     truth = labels.visible(mesh, scene, conformal.hemisphere_directions(), labels.motor_frames)
     return accuracy(logits > 0, torch.from_numpy(truth))

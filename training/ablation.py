@@ -2,8 +2,8 @@
 """Does the conformal encoding help? The paper's networks, trained alike on four encodings, three seeds each.
 
 `python -m training.ablation --network mlp` (and `--network visibility`, stage 1 of the paper's network, in which its
-shadows are learned): logs go to logs/ablation, and are drawn to docs/. What is there is not trained again. The same meshes, patches, turns and steps for all; only the numbers that
-the first layer reads differ, and its width with them.
+shadows are learned): logs go to logs/ablation, and are drawn to docs/. What is there is not trained again. The same
+meshes, patches, turns and steps for all; only the numbers that the first layer reads differ, and its width with them.
 """
 from __future__ import annotations
 

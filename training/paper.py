@@ -71,6 +71,7 @@ class Source:
         self.graph = graph(self.sample.positions.astype(np.float64), Neighbours(start, other[order].astype(np.int32)))
         self.blocked = (self.sample.unshadowed - self.sample.coefficients)[:, :paper.COEFFICIENTS]
         self.free = float(self.sample.visibility.mean())
+        self.lit = np.any(self.sample.normals != 0, axis=1)
 
     @cached_property
     def scene(self) -> Occluders:
@@ -98,7 +99,7 @@ class Source:
             places = self.scene.origins(sample.positions[rows], sample.normals[rows])
             seen = self.scene.blocked(np.repeat(places, seen.shape[1], axis=0),
                                       np.ascontiguousarray(directions.reshape(-1, 3), np.float32)) != 0
-        encoded = ENCODINGS[encoding][1](scale * paper_bake.placed(positions)[rows], normals)
+        encoded = ENCODINGS[encoding][1](scale * paper_bake.placed(positions, self.lit)[rows], normals)
         edges = within(self.graph, rows)
         return Example(*(torch.from_numpy(np.ascontiguousarray(a)).to(loop.device()) for a in (
             encoded.astype(np.float32), edges.source, edges.start, blocked.astype(np.float32),

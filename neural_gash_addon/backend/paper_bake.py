@@ -22,6 +22,7 @@ from .raycast import Geometry
 from .record import BakeRecord
 from .refine import refined
 from .transfer import Transfer
+from .workers import default_threads
 
 ORDER = 3   # bands that the paper's networks give
 SIDE = 8.0  # of what they are given: neighbours, a hundredth of a mesh apart, are then told apart as normals are
@@ -38,10 +39,17 @@ def import_torch(method: str) -> Any:
     return torch
 
 
-def placed(points: NDArray) -> NDArray[np.float64]:
-    """Points (N, 3) as the networks know them: box centred on the origin, longest side SIDE."""
-    low, high = points.min(0), points.max(0)
+def placed(points: NDArray, lit: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Points (N, 3) as the networks know them: box of those that are `lit` centred on the origin, longest side SIDE."""
+    seen = points[lit] if lit.any() else points
+    low, high = seen.min(0), seen.max(0)
     return (points - (low + high) / 2) * (SIDE / (float((high - low).max()) or 1.0))
+
+
+def encoded(mesh: TriangleMesh) -> NDArray[np.float32]:
+    """What the networks are given of a mesh's points: (N, 32)."""
+    lit = np.any(mesh.normals != 0, axis=1)
+    return conformal.encode(placed(mesh.points, lit), mesh.normals).astype(np.float32)
 
 
 def _bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
@@ -61,18 +69,22 @@ def _bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float 
     name = "mlp" if method == "mlp" else "gnn-paper"
     arrays = weights.load(weights.FOLDER / f"{name}.safetensors")
     lit = np.any(mesh.normals != 0, axis=1)
-    encoded = conformal.encode(placed(mesh.points), mesh.normals).astype(np.float32)
+    seen = encoded(mesh)
     yield 0.1
     edges = (graph(mesh.points, neighbours(mesh)) if name != "mlp"
              else Graph(np.zeros(len(lit) + 1, np.int64), np.zeros(0, np.int64)))
     yield 0.4
-    ask = partial(_answer, torch, name, arrays, encoded, edges)
+    ask = partial(_answer, torch, name, arrays, seen, edges)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads or default_threads())
     try:
         blocked = ask("cuda" if torch.cuda.is_available() else "cpu")
     except torch.cuda.OutOfMemoryError:
         _LOGGER.warning("The GPU has too little memory for this mesh; its processor does the work.")
         torch.cuda.empty_cache()
         blocked = ask("cpu")
+    finally:
+        torch.set_num_threads(before)
     coefficients = sh.cosine_lobe(mesh.normals, order) - blocked[:, :sh.coefficient_count(order)]
     if method == "gnn-paper-ao":
         coefficients = refined(coefficients, mesh.points, mesh.normals, edges)
@@ -82,7 +94,7 @@ def _bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float 
         seconds=time.perf_counter() - began, error_estimate=None))
 
 
-def _answer(torch: Any, name: str, arrays: dict[str, NDArray[np.float32]], encoded: NDArray[np.float32],
+def _answer(torch: Any, name: str, arrays: dict[str, NDArray[np.float32]], seen: NDArray[np.float32],
             edges: Graph, device: str) -> NDArray[np.float32]:
     """The blocked part (N, 9)."""
     from .networks import paper
@@ -91,7 +103,7 @@ def _answer(torch: Any, name: str, arrays: dict[str, NDArray[np.float32]], encod
     network.load_state_dict({key: torch.from_numpy(array.copy()) for key, array in arrays.items()})
     network.to(device).eval()
     with torch.no_grad():
-        found = network(*(torch.from_numpy(array).to(device) for array in (encoded, edges.source, edges.start)))
+        found = network(*(torch.from_numpy(array).to(device) for array in (seen, edges.source, edges.start)))
         return (found if name == "mlp" else found[0]).cpu().numpy()
 
 

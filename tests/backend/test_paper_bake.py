@@ -102,3 +102,14 @@ def test_the_paper_s_network_sees_some_shadows_and_size_does_not_matter():
 
 def test_weights_are_small_enough_to_ship():
     assert sum(path.stat().st_size for path in weights.FOLDER.glob("*.safetensors")) < 5e6
+
+
+@pytest.mark.parametrize("method", PAPERS)
+def test_loose_vertices_do_not_matter(method):
+    pytest.importorskip("torch")
+    mesh = knot()
+    loose = TriangleMesh.from_triangles(np.concatenate([mesh.positions, [[50.0, 0, 0]]]), mesh.triangles)
+    found = bake(loose, method)
+    assert not found[-1].any()
+    # the lone vertex takes part in the graph, as a neighbour of the nearest, but not in the size of what is encoded
+    np.testing.assert_allclose(np.median(np.abs(found[:-1] - bake(mesh, method))), 0, atol=1e-6)
