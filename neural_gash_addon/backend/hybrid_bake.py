@@ -55,8 +55,9 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
         while sample is not None:
             stop = last if rays is not None else min(max(2 * used, FIRST_RAYS), last)
             share = left if rays is not None else left / 2
-            blocked = yield from scaled(work.trace(used, stop), 1 - left, share)
+            traced, taken = yield from scaled(work.trace(used, stop), 1 - left, share)
             used, left = stop, left - share
+            blocked = work.blended(traced, taken, *sample.result())
             error = work.error(blocked, *sample.result())
             if used == last or (error is not None and tolerance is not None and error <= tolerance):
                 break
@@ -88,16 +89,20 @@ class _Work:
         self._sample_rays = int(np.clip(_SAMPLE_TIMES * rays, _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS))
         self.probes = 2 * self._sample_size * self._sample_rays
 
-    def trace(self, start: int, stop: int) -> Generator[float, None, NDArray[np.float32]]:
-        """The blocked part (N, K) of all points, from directions start..stop in addition to those before."""
+    def trace(self, start: int, stop: int) -> Generator[float, None, tuple[NDArray[np.float32], NDArray[np.float32]]]:
+        """The blocked part of all points from directions start..stop in addition to those before.
+
+        Returns:
+            (N, K) as it was traced, and as the network has it.
+        """
         yield from self._estimator.trace(self._pool, self._threads, self._lit, start, stop, self._sums)
         lit = self._lit
         local = self._estimator.means(lit, self._sums, 0, stop)
         traced = self._estimator.turned(self._pool, lit, local)
-        blocked = np.zeros_like(self._unshadowed)
-        blocked[lit] = filtered(*self._placed, self._curves, traced, self._unshadowed[lit], stop, self._network,
-                                self._pool)
-        return blocked
+        taken = filtered(*self._placed, self._curves, traced, self._unshadowed[lit], stop, self._network, self._pool)
+        out = np.zeros((2, *self._unshadowed.shape), np.float32)
+        out[0, lit], out[1, lit] = traced, taken
+        return out[0], out[1]
 
     def sample(self) -> tuple[NDArray, NDArray, NDArray]:
         """Some points (n,), and two independent traces (n, K) of their blocked part; on the calling thread."""
@@ -111,6 +116,24 @@ class _Work:
         found = [twin.turned_here(rows, twin.means(rows, twin.summed(rows, 0, self._sample_rays), 0, self._sample_rays))
                  for twin in (one, two)]
         return points, found[0], found[1]
+
+    def blended(self, traced: NDArray, taken: NDArray, points: NDArray, one: NDArray, two: NDArray
+                ) -> NDArray[np.float32]:
+        """traced + share * (taken - traced), (N, K), with the share of each band that is nearest the truth.
+
+        The sample says so: its two traces are independent of both, so the sum of (traced + share d - one) (traced +
+        share d - two) over it is the squared error and a constant, and is least where its derivative vanishes. So a
+        network that errs on a mesh, or where rays are many, is not followed.
+        """
+        moved = taken - traced
+        here = moved[points].astype(np.float64)
+        slope, curvature = (here * (one + two - 2 * traced[points])).sum(0), 2 * np.square(here).sum(0)
+        starts = np.square(np.arange(self._order))
+        slope, curvature = np.add.reduceat(slope, starts), np.add.reduceat(curvature, starts)
+        share = np.clip(np.divide(slope, curvature, out=np.ones_like(slope), where=curvature > 0), 0, 1)
+        moved *= np.repeat(share, 2 * np.arange(self._order) + 1).astype(np.float32)
+        moved += traced
+        return moved
 
     def error(self, blocked: NDArray, points: NDArray, one: NDArray, two: NDArray) -> float | None:
         """Relative L2 error at the sample. Both traces' noise is independent, so it cancels in the product."""

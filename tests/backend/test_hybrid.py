@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from neural_gash_addon.backend import hybrid, methods, metrics, texture, weights
+from neural_gash_addon.backend import hybrid, hybrid_bake, methods, metrics, texture, weights
 from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.errors import UserError
 from neural_gash_addon.backend.geometry import TriangleMesh
@@ -162,6 +162,14 @@ def test_threads_and_the_order_of_points_do_not_matter(case):
     first = run(mesh.points, mesh.normals, blocked, lobe)
     second = run(mesh.points[shuffle], mesh.normals[shuffle], blocked[shuffle], lobe[shuffle], threads=1)
     np.testing.assert_allclose(second, first[shuffle], atol=1e-5)
+
+
+@pytest.mark.parametrize("wrong", [lambda blocked: np.full_like(blocked, 0.1), lambda blocked: 3 * blocked])
+def test_a_network_that_errs_is_not_followed(case, monkeypatch, wrong):
+    mesh, unshadowed, truth = case
+    monkeypatch.setattr(hybrid_bake, "filtered", lambda places, normals, curves, blocked, *_: wrong(blocked))
+    plain, found = (metrics.srr(bake(mesh, m, 16).coefficients, truth, unshadowed) for m in ("embree", "hybrid"))
+    assert found < 1.1 * plain
 
 
 def test_error_is_measured_and_a_tolerance_is_met(case):
