@@ -21,6 +21,7 @@ from . import sampling
 from . import spherical_harmonics as sh
 from .geometry import INSET, TriangleMesh, unit
 from .patches import Patches
+from .pictures import Picture
 from .raycast import Geometry, Occluders
 from .transfer import Transfer
 from .workers import default_threads
@@ -40,6 +41,7 @@ class Reflection:
 
     albedo: NDArray[np.float64]  # (F, 3) of the triangles of what is baked, then of the occluders, in order
     bounces: int                 # at most; fewer where more would not be seen
+    pictures: Sequence[Picture] = ()  # that say it from place to place
     seed: int = 0                # one for all tiles of a texture
     solution: Bounces | None = None
 
@@ -53,7 +55,7 @@ class Reflection:
         order = transfer.record.order
         if self.solution is None:
             parts = [(mesh.positions, mesh.triangles), *occluders]
-            self.solution = Bounces(parts, self.albedo, scene, order, self.seed, threads)
+            self.solution = Bounces(parts, self.albedo, scene, order, self.seed, threads, pictures=self.pictures)
             yield from self.solution.solve(self.bounces)
         if not self.solution.used:
             return transfer
@@ -69,15 +71,15 @@ class Bounces:
     """The light that leaves each patch after its bounces, for points to gather."""
 
     def __init__(self, parts: Sequence[Geometry], albedo: NDArray, scene: Occluders, order: int, seed: int = 0,
-                 threads: int | None = None, budget: int = PATCHES) -> None:
+                 threads: int | None = None, budget: int = PATCHES, pictures: Sequence[Picture] = ()) -> None:
         """Prepare; nothing is traced yet.
 
         Args:
             parts: positions (V, 3), triangles (F, 3) of everything, in the order that `scene` has them.
-            albedo: (F, 3) of the triangles of all parts, 0 to 1.
+            albedo: (F, 3) of the triangles of all parts, 0 to 1. pictures: that say it from place to place.
         """
         self.patches = Patches(parts, budget)
-        self.albedo = np.clip(self.patches.mean(np.asarray(albedo, np.float64)), 0, 1)  # (M, 3)
+        self.albedo = np.clip(self.patches.mean(albedo, pictures), 0, 1)  # (M, 3)
         self.added: list[float] = []  # transfer of constant light that each bounce added, of all of it
         self._scene, self._order, self._seed = scene, order, seed
         self._threads = threads or default_threads()

@@ -21,7 +21,7 @@ from .workers import default_threads
 Array = NDArray[np.float64]
 
 _ROWS = 256       # of one small matrix product: its operands stay in the second-level cache
-_LIT_ROWS = 1024  # small enough for BLAS to stay on one thread
+_LIT_ROWS = 2048  # their products stay in the second-level cache while they are dealt out to the images
 _BLOCK = 1 << 16  # points at a time, so that memory does not grow with their number
 
 
@@ -115,9 +115,12 @@ def lit_channels(transfer: NDArray[np.float32], light: NDArray, channels: int, o
     products = np.pi * light_matrix(light, sh.order_of(coefficients)).transpose(1, 0, 2)
     matrix[:, 3:3 + 3 * coefficients] = products.reshape(coefficients, -1)
 
+    pixel = np.dtype((np.void, 4 * channels))  # moved whole: twice as quick as channel by channel
+    pixels = out.view(pixel)[..., 0]
+
     def block(start: int) -> None:
-        found = transfer[start:start + _LIT_ROWS] @ matrix  # stays in the cache while it is dealt out to the images
-        out[:, start:start + _LIT_ROWS] = found.reshape(len(found), len(out), channels).transpose(1, 0, 2)
+        found = transfer[start:start + _LIT_ROWS] @ matrix
+        pixels[:, start:start + _LIT_ROWS] = found.view(pixel).T
 
     with ThreadPoolExecutor(default_threads()) as pool:
         list(pool.map(block, range(0, count, _LIT_ROWS)))

@@ -21,6 +21,7 @@ from . import spherical_harmonics as sh
 from .bounce import Bounces, spread
 from .errors import UserError
 from .geometry import Surface, TriangleMesh, unit
+from .pictures import Picture
 from .progress import scaled
 from .raster import Layout
 from .raycast import Geometry, Occluders
@@ -43,6 +44,7 @@ class Finish:
     specular: NDArray[np.float64]   # (F, 3) of the lobe
     roughness: NDArray[np.float64]  # (F,) Blender's, 0 to 1
     lobe: str = lobes.GGX           # what the roughness means
+    pictures: Sequence[Picture] = ()  # that say all of it, in this order, from place to place
 
 
 class GlossyBounces:
@@ -60,10 +62,11 @@ class GlossyBounces:
         self._light = np.asarray(light, np.float64)
         self._threads = threads or default_threads()
         self._seed = seed
-        self._bounces = Bounces(parts, finish.albedo, scene, self._order, seed, threads)
+        self._bounces = Bounces(parts, finish.albedo, scene, self._order, seed, threads, pictures=finish.pictures)
         patches = self._bounces.patches
-        self._specular = patches.mean(finish.specular)
-        bands = lobes.attenuation(patches.mean(finish.roughness[:, None])[:, 0], self._order, finish.lobe)
+        values = patches.mean(np.column_stack([finish.albedo, finish.specular, finish.roughness]), finish.pictures)
+        self._specular = values[:, 3:6]
+        bands = lobes.attenuation(values[:, 6], self._order, finish.lobe)
         self._damping = np.repeat(bands, 2 * np.arange(self._order) + 1, axis=1)       # (M, K)
         self._normals = unit(patches.mean(patches.normals))                            # (M, 3)
         self._leaving = np.zeros((0, self._order ** 2, 3), np.float32)  # by the direction of the ray that meets it

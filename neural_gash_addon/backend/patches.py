@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .estimator import morton_order
+from .pictures import PLACES, Picture
 from .raycast import Geometry, Hits
 
 _MOST_CUTS = 256  # of a triangle's edge
@@ -72,12 +73,29 @@ class Patches:
         piece = self._start[hits.faces] + np.clip(i * (2 * n - i) + 2 * j + upper, 0, n * n - 1)
         return 2 * self._patch[piece] + ~hits.front
 
-    def mean(self, values: NDArray) -> NDArray[np.float64]:
-        """Of values (F, C) of the triangles, the mean over each patch (M, C)."""
+    def mean(self, values: NDArray, pictures: Sequence[Picture] = ()) -> NDArray[np.float64]:
+        """Of values (F, C) of the triangles, the mean over each patch (M, C); where triangles are cut, of pictures."""
+        of_pieces = np.asarray(values, np.float64)[self.faces]
+        for picture in pictures:
+            row = np.full(len(self._cuts), -1)
+            row[picture.triangles] = np.arange(len(picture.triangles))
+            pieces = np.flatnonzero((row[self.faces] >= 0) & (self._cuts[self.faces] > 1))
+            known = picture.columns < of_pieces.shape[1]
+            u, v = self._within(np.repeat(pieces, len(PLACES)), *np.tile(PLACES[:, 1:], (len(pieces), 1)).T)
+            found = picture.at(np.repeat(row[self.faces[pieces]], len(PLACES)), np.stack([1 - u - v, u, v], 1))
+            found = found.reshape(len(pieces), len(PLACES), found.shape[1]).mean(1)
+            of_pieces[pieces[:, None], picture.columns[known]] = found[:, known]
         weight = np.maximum(self.areas[self.faces] / self._cuts[self.faces] ** 2, 1e-300)
         total = np.bincount(self._patch, weight, self.count)[:, None]
-        return np.stack([np.bincount(self._patch, weight * values[self.faces, c], self.count)
-                         for c in range(values.shape[1])], 1) / total
+        return np.stack([np.bincount(self._patch, weight * column, self.count) for column in of_pieces.T], 1) / total
+
+    def _within(self, piece: NDArray[np.int64], a: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
+        """Barycentric coordinates u, v in its triangle of those in a piece, a and b."""
+        face = self.faces[piece]
+        n, t = self._cuts[face], piece - self._start[face]
+        i = n - np.ceil(np.sqrt(n * n - t)).astype(np.int64)
+        j, upper = np.divmod(t - i * (2 * n - i), 2)
+        return np.where(upper, i + 1 - a, i + a) / n, np.where(upper, j + 1 - b, j + b) / n
 
     def sample(self, sides: NDArray[np.int64], rays: int, rng: np.random.Generator
                ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -92,13 +110,8 @@ class Patches:
         at = np.searchsorted(total, low[:, None] + place * (high - low)[:, None], side="right") - 1
         piece = order[np.clip(at, first[patches][:, None], first[patches + 1][:, None] - 1)]
         face = self.faces[piece]
-        n, t = self._cuts[face], piece - self._start[face]
-        i = n - np.ceil(np.sqrt(n * n - t)).astype(np.int64)
-        j, upper = np.divmod(t - i * (2 * n - i), 2)
         a, b = rng.uniform(size=(2, *face.shape))
-        a, b = np.where(a + b > 1, 1 - a, a), np.where(a + b > 1, 1 - b, b)
-        u = np.where(upper, i + 1 - a, i + a) / n
-        v = np.where(upper, j + 1 - b, j + b) / n
+        u, v = self._within(piece, *np.where(a + b > 1, [1 - a, 1 - b], [a, b]))
         corners = self.corners[face]
         points = (corners[..., 0, :] * (1 - u - v)[..., None] + corners[..., 1, :] * u[..., None]
                   + corners[..., 2, :] * v[..., None])

@@ -23,9 +23,9 @@ from .raycast import Geometry, Occluders
 from .texels import NormalMap, texel_points
 from .unwrap import Charts, lay_out
 
-TRIALS = (32, 64, 128, 256, 512)  # texels a side
+TRIALS = (32, 64, 128, 256, 512, 1024, 2048)  # texels a side
 MAX_FIT = 4096                    # the largest texture that an error asks for
-_POINTS = 1024                    # of the surface that are looked at
+_POINTS = 4096                    # of the surface that are looked at
 _RAYS = 256                       # from each and from its texels, for each of two traces
 _LEAST_RATE, _MOST_RATE = 0.5, 2.0  # powers of the size by which an error falls: at a shadow's edge, where smooth
 _STEP = 16                        # texels to which sizes are rounded up
@@ -116,9 +116,15 @@ def _around(coverage: Coverage, places: NDArray) -> tuple[NDArray[np.int64], NDA
         there = coverage.texels[found] == texel
         rows[:, corner] = found
         mix[:, corner] = there * (along[:, 0] if i else 1 - along[:, 0]) * (along[:, 1] if j else 1 - along[:, 1])
-    lost = mix.sum(1) <= 0  # texels of which other charts took all: what a fill would show, near enough
-    mix[lost, 0] = 1
+    lost = np.flatnonzero(mix.sum(1) <= 0)  # other charts took the texels: what a fill shows there
+    rows[lost, 0], mix[lost, 0] = _nearest(coverage, np.clip(np.rint(x[lost]), 0, side - 1).astype(np.int64)), 1
     return rows, mix / mix.sum(1, keepdims=True)
+
+
+def _nearest(coverage: Coverage, texels: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Row of the covered texel that is nearest to each of some columns and rows (n, 2)."""
+    rows, columns = np.divmod(coverage.texels, coverage.side)
+    return np.array([np.argmin((columns - column) ** 2 + (rows - row) ** 2) for column, row in texels], np.int64)
 
 
 def _traced(points: TriangleMesh, *, method: str, order: int, scene: Occluders | None, seed: int, threads: int | None,

@@ -19,7 +19,7 @@ from ..backend.texture import TextureTransfer
 from ..scene import staleness
 from ..scene.attributes import has_bake, read_record
 from ..scene.gloss import can_gloss
-from ..scene.gloss_bounce import folder_of, write_bounces
+from ..scene.gloss_bounce import finish_key, folder_of, write_bounces
 from ..scene.images import bake_images, make_images
 from ..scene.lighting import current_light, light_object
 from ..scene.normal_maps import read_normal_maps
@@ -40,7 +40,7 @@ class _Job:
     names: list[str]
     record: BakeRecord
     light: NDArray   # (K, 3) in the frame of the bake
-    finish: NDArray  # (F, 7)
+    finish: str  # `finish_key`
     lobe: str
     baking: Generator[float, None, TextureTransfer]
 
@@ -87,14 +87,14 @@ class NEURAL_GASH_OT_bake_gloss(Baking, bpy.types.Operator):
             raise UserError(f"'{obj.name}' was turned since its bake; bake it again first.")
         depsgraph = context.evaluated_depsgraph_get()
         read = read_object(obj, depsgraph)
-        finish = read_finish(obj, record.occluders, depsgraph)
+        finish, pictures = read_finish(obj, record.occluders, depsgraph)
         light = sh.rotate(current_light(context.scene, record.order), turn_since(obj, record))
         lobe = context.scene.neural_gash.lobe
         baking = bake(read.surface, read_uv(obj.data, record.uv_map), record, light,
-                      Finish(finish[:, :3], finish[:, 3:6], finish[:, 6], lobe), bounces=self.bounces,
+                      Finish(finish[:, :3], finish[:, 3:6], finish[:, 6], lobe, pictures), bounces=self.bounces,
                       occluders=read_occluders(obj, record.occluders, depsgraph),
                       normal_maps=read_normal_maps(obj, depsgraph, read.surface, read.matrix))
-        return _Job(obj.session_uid, [obj.name], record, light, finish, lobe, baking)
+        return _Job(obj.session_uid, [obj.name], record, light, finish_key(finish, pictures), lobe, baking)
 
     def _finish(self, context: bpy.types.Context, job: _Job, transfer: TextureTransfer) -> set[str]:
         obj = next((o for o in bpy.data.objects if o.session_uid == job.uid), None)

@@ -98,7 +98,8 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
         if settings.target != TEXTURE and attribute_count(3 * settings.order ** 2) > EEVEE_ATTRIBUTES:
             raise UserError(f"With bounces, an order-{settings.order} bake takes more than the {EEVEE_ATTRIBUTES} "
                             "attributes that EEVEE draws; choose order 4 or less, or bake to a texture.")
-        reflection = Reflection(read_finish(obj, mode, depsgraph)[:, :3], settings.bounces)
+        finish, pictures = read_finish(obj, mode, depsgraph)
+        reflection = Reflection(finish[:, :3], settings.bounces, pictures)
     occluders = read_occluders(obj, mode, depsgraph)
     bake: Callable[..., Generator[float, None, Transfer | TextureTransfer]]
     texture = None

@@ -2,29 +2,32 @@
 """How an object's triangles reflect, from the base colours of its materials, their metal and their roughness."""
 from __future__ import annotations
 
+from dataclasses import replace
+
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.errors import UserError
-from ..backend.texels import bilinear
+from ..backend.pictures import Picture
 from .gloss_nodes import SPECULAR
 from .nodes import DEFAULT_ALBEDO
 from .preview import COLOUR_SOCKETS, DEFAULT_ROUGHNESS, shader_node, shown_material
 from .world import linear_pixels
 
-# where in a triangle an image is looked up: its centre and half-way to its corners
-_PLACES = np.array([[4, 4, 4], [8, 2, 2], [2, 8, 2], [2, 2, 8]]) / 12
+Finish = tuple[NDArray[np.float64], list[Picture]]  # (F, 7) of triangles, and images that say it from place to place
 
 
-def triangle_finish(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArray[np.int32]) -> NDArray[np.float64]:
-    """(F, 7) of the triangles with these face corners (F, 3): albedo, specular colour (linear) and roughness.
+def triangle_finish(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArray[np.int32]) -> Finish:
+    """Of the triangles with these face corners (F, 3): albedo, specular colour (linear) and roughness (F, 7).
 
     A plain colour or an image by UV counts; where other nodes make the colour, the socket's own value
     does. What is metallic reflects nothing diffusely, and mirrors its colour.
 
     Args:
         obj: evaluated, or not. mesh: its geometry, whose loop triangles have been computed.
+    Returns:
+        The means over each triangle, and the images.
     """
     polygons = np.empty(len(mesh.loop_triangles), np.int32)
     mesh.loop_triangles.foreach_get("polygon_index", polygons)
@@ -32,52 +35,64 @@ def triangle_finish(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArra
     mesh.polygons.foreach_get("material_index", slots)
     materials = [shown_material(slot.material.original if slot.material else None) for slot in obj.material_slots]
     slot_of = np.clip(slots[polygons], 0, max(len(materials) - 1, 0))
-    out = np.empty((len(corners), 7))
-    out[:] = _finish(None, mesh, corners)
-    for number, material in enumerate(materials):
-        here = slot_of == number
-        if here.any():
-            out[here] = _finish(material, mesh, corners[here])
-    return np.clip(np.nan_to_num(out), 0, 1)
+    out, pictures = np.empty((len(corners), 7)), []
+    for number, material in enumerate(materials or [None]):
+        here = np.flatnonzero(slot_of == number)
+        if len(here):
+            out[here], found = _finish(material, mesh, corners[here])
+            pictures += [replace(picture, triangles=here) for picture in found]
+    out = np.clip(np.nan_to_num(out), 0, 1)
+    for picture in pictures:
+        out[picture.triangles[:, None], picture.columns] = picture.lookups().mean(1)
+    return out, pictures
 
 
-def _finish(material: bpy.types.Material | None, mesh: bpy.types.Mesh, corners: NDArray) -> NDArray[np.float64]:
-    """(f, 7) of one material."""
+def _finish(material: bpy.types.Material | None, mesh: bpy.types.Mesh, corners: NDArray) -> Finish:
+    """(7,) of one material, and the images that say it better, of these triangles (f, 3)."""
     node = shader_node(material)
-    out = np.empty((len(corners), 7))
-    metallic, out[:, 6] = 0.0, DEFAULT_ROUGHNESS
+    out, pictures = np.empty(7), []
+    metallic, out[6] = 0.0, DEFAULT_ROUGHNESS
     if node is None:
-        out[:, :3] = DEFAULT_ALBEDO if material is None else material.diffuse_color[:3]
+        out[:3] = DEFAULT_ALBEDO if material is None else material.diffuse_color[:3]
     else:
-        out[:, :3] = _value(node.inputs[COLOUR_SOCKETS[node.type]], mesh, corners)
+        socket = node.inputs[COLOUR_SOCKETS[node.type]]
+        out[:3] = _value(socket)
         if "Metallic" in node.inputs and not node.inputs["Metallic"].is_linked:
             metallic = node.inputs["Metallic"].default_value
+        pictures = _pictures(socket, mesh, corners, np.arange(6), np.arange(6) % 3,
+                             np.repeat([1 - metallic, metallic], 3), np.repeat([0.0, SPECULAR * (1 - metallic)], 3))
         if "Roughness" in node.inputs:
-            out[:, 6] = _value(node.inputs["Roughness"], mesh, corners)[..., :1].mean(-1)
-    out[:, 3:6] = SPECULAR + metallic * (out[:, :3] - SPECULAR)
-    out[:, :3] *= 1 - metallic
-    return out
+            out[6] = _value(node.inputs["Roughness"])[0]
+            pictures += _pictures(node.inputs["Roughness"], mesh, corners, *np.array([[6], [0], [1], [0]]))
+    out[3:6] = SPECULAR + metallic * (out[:3] - SPECULAR)
+    out[:3] *= 1 - metallic
+    return out, pictures
 
 
-def _value(socket: bpy.types.NodeSocket, mesh: bpy.types.Mesh, corners: NDArray) -> NDArray[np.float64]:
-    """(3,) or (f, 3) of an input, a colour or a number."""
-    own = np.resize(np.array(socket.default_value, float), 4)[:3]
+def _value(socket: bpy.types.NodeSocket) -> NDArray[np.float64]:
+    """(3,) of an input, a colour or a number."""
     source = socket.links[0].from_node if socket.is_linked else None
     if source is not None and source.type == "RGB":
         return np.array(source.outputs[0].default_value[:3])
-    if source is not None and source.type == "TEX_IMAGE" and source.image is not None:
-        layer = _uv_layer(source, mesh)
-        if layer is not None:
-            try:
-                pixels = linear_pixels(source.image)[..., :3]
-            except UserError:
-                return own  # pink on screen, too
-            uv = np.empty((len(layer.uv), 2), np.float32)
-            layer.uv.foreach_get("vector", uv.ravel())
-            places = np.einsum("pc,fcx->fpx", _PLACES, uv[corners])
-            pixels = np.nan_to_num(pixels)
-            return bilinear(pixels, places.reshape(-1, 2)).reshape(len(corners), len(_PLACES), 3).mean(1)
-    return own
+    return np.resize(np.array(socket.default_value, float), 4)[:3]
+
+
+def _pictures(socket: bpy.types.NodeSocket, mesh: bpy.types.Mesh, corners: NDArray, columns: NDArray,
+              channels: NDArray, gain: NDArray, offset: NDArray) -> list[Picture]:
+    """The image that an input takes its value from by UV, if it does."""
+    source = socket.links[0].from_node if socket.is_linked else None
+    if source is None or source.type != "TEX_IMAGE" or source.image is None:
+        return []
+    layer = _uv_layer(source, mesh)
+    if layer is None:
+        return []
+    try:
+        pixels = np.nan_to_num(linear_pixels(source.image)[..., :3])
+    except UserError:
+        return []  # pink on screen, too
+    uv = np.empty((len(layer.uv), 2), np.float32)
+    layer.uv.foreach_get("vector", uv.ravel())
+    return [Picture(np.arange(len(corners)), uv[corners].astype(np.float64), pixels, columns, channels, gain, offset)]
 
 
 def _uv_layer(texture: bpy.types.Node, mesh: bpy.types.Mesh) -> bpy.types.MeshUVLoopLayer | None:

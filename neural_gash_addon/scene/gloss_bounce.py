@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..backend import lobes
 from ..backend.errors import UserError
+from ..backend.pictures import Picture
 from ..backend.record import BakeRecord
 from .images import BOUNCED, attach, detach
 
@@ -26,17 +27,19 @@ def light_key(light: NDArray) -> str:
     return f"{size:.4g}:" + hashlib.blake2b((np.rint(light / size * 1e4) + 0.0).tobytes(), digest_size=8).hexdigest()
 
 
-def finish_key(finish: NDArray) -> str:
-    """What tells how everything reflects (F, 7) from any other."""
-    return hashlib.blake2b(np.rint(finish * 1e3).astype(np.int32).tobytes(), digest_size=8).hexdigest()
+def finish_key(finish: NDArray, pictures: Sequence[Picture]) -> str:
+    """What tells how everything reflects, as `read_finish` says it, from any other."""
+    parts = [finish, *(picture.lookups() for picture in pictures)]
+    return hashlib.blake2b(b"".join(np.rint(part * 1e3).astype(np.int32).tobytes() for part in parts),
+                           digest_size=8).hexdigest()
 
 
 def write_bounces(data: bpy.types.Mesh, images: Sequence[bpy.types.Image], record: BakeRecord, light: NDArray,
-                  finish: NDArray, lobe: str) -> None:
+                  finish: str, lobe: str) -> None:
     """Make images those of the mesh's glossy bounces, in place of any earlier ones."""
     discard_bounces(data)
     attach(data, images, BOUNCED)
-    data[_STATE] = json.dumps({"record": record.to_json(), "light": light_key(light), "finish": finish_key(finish),
+    data[_STATE] = json.dumps({"record": record.to_json(), "light": light_key(light), "finish": finish,
                                "lobe": lobe})
 
 
@@ -72,10 +75,10 @@ def bounces_for(data: bpy.types.Mesh, light: NDArray, lobe: str) -> BakeRecord |
     return found
 
 
-def finish_fits(data: bpy.types.Mesh, finish: NDArray) -> bool:
-    """Whether the glossy bounces of a mesh are of these colours and this roughness (F, 7); True where it has none."""
+def finish_fits(data: bpy.types.Mesh, finish: str) -> bool:
+    """Whether the glossy bounces of a mesh are of these colours and this roughness; True where it has none."""
     state = _state(data)
-    return state is None or state["finish"] == finish_key(finish)
+    return state is None or state["finish"] == finish
 
 
 def _state(data: bpy.types.Mesh) -> dict | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import bpy
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..backend.errors import UserError
 from ..backend.geometry import Surface, TriangleMesh, unit
-from .albedo import triangle_finish
+from .albedo import Finish, triangle_finish
 from .attributes import RECORD, discard
 from .evaluation import evaluated, revealed, shown_objects
 from .frames import Array, as_array, bake_frame, rotation_part
@@ -178,15 +178,23 @@ def read_occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgr
             for local, triangles, _, matrix in _occluders(obj, mode, depsgraph)]
 
 
-def read_finish(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph) -> Array:
-    """(F, 7) of `triangle_finish` of the triangles of `obj`, then of those of `read_occluders`, in its order."""
+def read_finish(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph) -> Finish:
+    """`triangle_finish` of the triangles of `obj`, then of those of `read_occluders`, in its order."""
     with evaluated(obj, depsgraph) as copy:
         mesh = copy.to_mesh()
         try:
             own = triangle_finish(obj, mesh, _triangle_corners(mesh))
         finally:
             copy.to_mesh_clear()
-    return np.concatenate([own, *(finish for _, _, finish, _ in _occluders(obj, mode, depsgraph, coloured=True))])
+    values: list[Array] = []
+    pictures = []
+    others = ((finish, matrix) for _, _, finish, matrix in _occluders(obj, mode, depsgraph, coloured=True))
+    for (found, images), matrix in [(own, as_array(obj.matrix_world)), *others]:
+        start = sum(map(len, values))
+        pictures += [replace(image, triangles=start + image.triangles, uv=_outward(image.uv, matrix))
+                     for image in images]
+        values.append(found)
+    return np.concatenate(values), pictures
 
 
 def fingerprint(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, occluder_mode: str = SELF,
@@ -242,7 +250,10 @@ def fingerprint(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, occluder_
             entries.append(shapes[id(local)][1] + _place(seen @ place, grain))
         digest.update(b"".join(sorted(entries)))
     if bounces:
-        digest.update(np.round(read_finish(obj, occluder_mode, depsgraph)[:, :3], 4).tobytes())
+        finish, pictures = read_finish(obj, occluder_mode, depsgraph)
+        digest.update(np.round(finish[:, :3], 4).tobytes())
+        for picture in pictures:
+            digest.update(np.round(picture.lookups()[..., picture.columns < 3], 4).tobytes())
     return digest.hexdigest() + ":" + ",".join(text)
 
 
@@ -259,10 +270,10 @@ def same_fingerprint(first: str, second: str) -> bool:
 
 
 def _occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph, coloured: bool = False,
-               ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int32], Array, Array]]:
+               ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int32], Finish, Array]]:
     """(local positions, triangles, finish, world matrix) of each object and instance that blocks, but `obj`.
 
-    The finish (F, 7) is empty unless `coloured`: images take time to read.
+    The finish is empty unless `coloured`: images take time to read.
     """
     if mode == SELF:
         return
@@ -279,12 +290,12 @@ def _occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph,
 
 
 def _instances(depsgraph: bpy.types.Depsgraph, owners: set[int] | None, baked: bpy.types.Object | None, coloured: bool,
-               ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int32], Array, Array]]:
+               ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int32], Finish, Array]]:
     """The solid objects and instances of a depsgraph; of the objects in `owners` only, where given.
 
     `baked` itself is left out, but instances of it elsewhere are not.
     """
-    known: dict[tuple[int, int], tuple[NDArray, NDArray, Array] | None] = {}
+    known: dict[tuple[int, int], tuple[NDArray, NDArray, Finish] | None] = {}
     shown = shown_objects(depsgraph.view_layer) if owners is None else set()
     for instance in depsgraph.object_instances:
         solid = instance.object
@@ -307,8 +318,8 @@ def _instances(depsgraph: bpy.types.Depsgraph, owners: set[int] | None, baked: b
 
 
 def _solid_arrays(solid: bpy.types.Object, coloured: bool
-                  ) -> tuple[NDArray[np.float32], NDArray[np.int32], Array] | None:
-    """Local positions, triangles and their finish (F, 7) of an evaluated object; None where it has no faces."""
+                  ) -> tuple[NDArray[np.float32], NDArray[np.int32], Finish] | None:
+    """Local positions, triangles and their finish of an evaluated object; None where it has no faces."""
     try:
         mesh = solid.to_mesh()
     except RuntimeError:  # Blender's way to say that the object has no geometry, as a second metaball
@@ -322,8 +333,9 @@ def _solid_arrays(solid: bpy.types.Object, coloured: bool
         corners = _triangle_corners(mesh)
         triangles = _corner_vertices(mesh)[corners]
         whole = np.isfinite(positions).all(axis=1)[triangles].all(axis=1)
-        finish = triangle_finish(solid, mesh, corners)[whole] if coloured else np.zeros((0, 7))
-        return np.nan_to_num(positions), triangles[whole], finish
+        finish, pictures = triangle_finish(solid, mesh, corners) if coloured else (np.zeros((len(whole), 7)), [])
+        return (np.nan_to_num(positions), triangles[whole],
+                (finish[whole], [picture.only(whole) for picture in pictures]))
     finally:
         solid.to_mesh_clear()
 
@@ -382,8 +394,8 @@ def _transform(local: NDArray[np.float32], matrix: Array) -> Array:
     return local.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def _outward(triangles: NDArray[np.int32], matrix: Array) -> NDArray[np.int32]:
-    """The triangles wound as in local coordinates also where the matrix mirrors, which turns them round."""
+def _outward(triangles: NDArray, matrix: Array) -> NDArray:
+    """Triangles (F, 3, ...) wound as in local coordinates also where the matrix mirrors, which turns them round."""
     return triangles[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else triangles
 
 

@@ -13,7 +13,7 @@ from bpy.app.handlers import persistent
 from ..backend.errors import UserError
 from ..backend.record import BakeRecord
 from .attributes import check_whole, has_bake, read_record
-from .gloss_bounce import finish_fits, has_bounces
+from .gloss_bounce import finish_fits, finish_key, has_bounces
 from .preview import is_preview
 from .read import SELF, fingerprint, read_finish, same_fingerprint
 from .uv_maps import read_uv
@@ -145,7 +145,7 @@ def _compare_changed() -> None:
 def _gloss_fits(obj: bpy.types.Object, record: BakeRecord) -> bool:
     """Whether the glossy bounces, if there are any, are of the materials as they are."""
     return not has_bounces(obj.data) or finish_fits(
-        obj.data, read_finish(obj, record.occluders, bpy.context.evaluated_depsgraph_get()))
+        obj.data, finish_key(*read_finish(obj, record.occluders, bpy.context.evaluated_depsgraph_get())))
 
 
 def _reflects(obj: bpy.types.Object) -> bool:
