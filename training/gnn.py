@@ -21,8 +21,8 @@ from neural_gash_addon.backend.conformal import DIRECTION_COUNT
 from . import data, labels, loop
 from .curves import draw
 
-CONE = (48, 16)                # units of stage 1
-POINT = (160, 96)              # of stage 2
+CONE = (32, 12)                # units of stage 1
+POINT = (128, 64)              # of stage 2
 STEPS, RATE = 12_000, 2e-3
 POINTS = 3000                  # of a step
 MOST_POINTS = 60_000           # of a mesh in memory

@@ -70,7 +70,6 @@ def _at(level: Level, places: NDArray, along: NDArray[np.float32], distance: flo
     """(4, 25, n) of the voxels at a distance from places (3, n) along directions (3, 25, n)."""
     at = along * np.float32(distance / level.size)
     at += (places / level.size - level.low[:, None]).astype(np.float32)[:, None]
-    np.clip(at, 0, np.array(level.shape, np.float32)[:, None, None] - 1, out=at)
     cell = at.astype(np.int32)
     index = cell[0]
     for axis in (1, 2):

@@ -28,9 +28,10 @@ from .geometry import TriangleMesh
 from .voxels import Pyramid
 
 ORDER = 5              # bands that the network gives
-CHUNK = 512            # points at a time: what is between the layers stays in the second-level cache
+CHUNK = 4096           # points at a time, at most: many, as threads wait for each other between calls of NumPy
 _BLAS_SERIAL = 1 << 18  # multiply-adds up to which OpenBLAS stays on the calling thread
-_BLEND = (-0.3, -0.7)  # heights of the normal between which the frame's pole changes
+_COLUMNS = 32          # of values at a time, at least: with fewer, reading the weights takes the time
+_BLEND = (-0.4, -0.6)  # heights of the normal between which the frame's pole changes
 _OVER = np.diag([1.0, -1.0, -1.0])  # half a turn about e_x
 
 Network = Mapping[str, NDArray[np.float32]]  # weights (outputs, inputs) and biases of the layers, see `answer`
@@ -63,9 +64,8 @@ def frames_of(normals: NDArray, over: bool) -> NDArray[np.float64]:
 def answer(seen: NDArray[np.float32], network: Network) -> NDArray[np.float32]:
     """The blocked part (n, ORDER**2) in the frames in which `seen` (F, 25, n) was read."""
     features, _, count = seen.shape
-    now = _layer(network, "cone.0", seen.reshape(features, -1))
-    now = now.reshape(-1, DIRECTION_COUNT, count)
-    now += network["direction"].T[:, :, None]
+    now = _product(network["cone.0.weight"], seen.reshape(features, -1)).reshape(-1, DIRECTION_COUNT, count)
+    now += (network["direction"] + network["cone.0.bias"]).T[:, :, None]
     np.maximum(now, 0, out=now)
     now = _rectified(network, "cone.1", now.reshape(len(now), -1))
     now = now.reshape(-1, count)  # of each unit of stage 1, all directions
@@ -75,14 +75,28 @@ def answer(seen: NDArray[np.float32], network: Network) -> NDArray[np.float32]:
 
 
 def _layer(network: Network, name: str, values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(outputs, n) of values (inputs, n), in products too small for BLAS to spread over threads of its own."""
-    weight, bias = network[f"{name}.weight"], network[f"{name}.bias"]
-    out = np.empty((len(weight), values.shape[1]), np.float32)
-    columns = max(1, _BLAS_SERIAL // weight.size)
-    for start in range(0, values.shape[1], columns):
-        part = slice(start, start + columns)
-        np.matmul(weight, values[:, part], out=out[:, part])
-    out += bias[:, None]
+    """(outputs, n) of values (inputs, n)."""
+    out = _product(network[f"{name}.weight"], values)
+    out += network[f"{name}.bias"][:, None]
+    return out
+
+
+def _product(weight: NDArray[np.float32], values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """weight (outputs, inputs) @ values (inputs, n) in pieces too small for BLAS to spread over threads of its own.
+
+    Those would wait for each other, and spin meanwhile on the cores that the other points want.
+    """
+    (outputs, inputs), count = weight.shape, values.shape[1]
+    rows = next(rows for rows in range(outputs, 0, -1)
+                if outputs % rows == 0 and (rows * inputs * _COLUMNS <= _BLAS_SERIAL or rows == 1))
+    columns = min(count, max(_BLAS_SERIAL // (rows * inputs), 1))
+    out = np.empty((outputs, count), np.float32)
+    tiles, parts = weight.reshape(-1, 1, rows, inputs), out.reshape(-1, rows, count)
+    whole = count - count % max(columns, 1)
+    if whole:
+        np.matmul(tiles, values[:, :whole].reshape(inputs, -1, columns).transpose(1, 0, 2),
+                  out=parts[:, :, :whole].reshape(len(parts), rows, -1, columns).transpose(0, 2, 1, 3))
+    np.matmul(tiles[:, 0], values[:, whole:], out=parts[:, :, whole:])
     return out
 
 

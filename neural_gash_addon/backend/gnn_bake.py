@@ -42,7 +42,8 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
         blocked = gnn.blocked(mesh, voxels, network, order, rows)
         return rows, sh.cosine_lobe(mesh.normals[rows], order) - blocked
 
-    jobs = ((lit[start:start + gnn.CHUNK],) for start in range(0, len(lit), gnn.CHUNK))
+    rounds = max(1, -(-len(lit) // (threads * gnn.CHUNK)))
+    jobs = ((rows,) for rows in np.array_split(lit, threads * rounds) if len(rows))  # the threads end together
     with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
         asking = results(pool, threads, jobs, work)
         try:

@@ -27,7 +27,7 @@ _GOLDEN = 0.6180339887498949
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """The voxels of one size, with an empty one all round."""
+    """The voxels of one size, as far as they are read."""
 
     # (x * y * z,) four float32 each: the area a in the voxel, in its faces, as a / (1 + a), and the sum of area times
     # normal, over 1 + a, too. One item of 16 bytes, because NumPy gathers items faster than rows.
@@ -140,16 +140,17 @@ def _levels(places: NDArray, values: NDArray[np.float32], box: NDArray, reaches:
             cells = np.concatenate([cells, np.floor(here / size).astype(np.int64)], 1)
             sums = np.concatenate([sums, values if whole else values[:, inside]], 1)
             places, values = (places[:, :0], values[:, :0]) if whole else (places[:, ~inside], values[:, ~inside])
-        low = np.array([row.min(initial=0) - 1 for row in cells])
-        shape = np.array([row.max(initial=0) + 2 for row in cells]) - low
+        low = np.full(3, int(np.floor(-reach / size)))
+        shape = np.floor((box + reach) / size).astype(np.int64) + 1 - low
         index = ((cells[0] - low[0]) * shape[1] + cells[1] - low[1]) * shape[2] + cells[2] - low[2]
         grid = np.zeros((int(shape.prod()), 4), np.float32)
         filled = np.zeros(len(grid), bool)
         filled[index] = True
         full = np.flatnonzero(filled)
-        for column, value in enumerate(sums):
-            np.add.at(grid[:, column], index, value)
-        sums = grid[full].T
+        rank = np.empty(len(grid), np.int32)  # of each full voxel; pages that are not written to cost nothing
+        rank[full] = np.arange(len(full), dtype=np.int32)
+        index = rank[index]
+        sums = np.stack([np.bincount(index, value, len(full)) for value in sums]).astype(np.float32)
         area = sums[0] * np.float32(1 / size ** 2)
         grid[full] = (sums * (np.float32(1 / size ** 2) / (1 + area))).T
         cells = (np.stack(np.unravel_index(full, tuple(shape))) + low[:, None]) >> 1
