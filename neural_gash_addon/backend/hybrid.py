@@ -60,10 +60,10 @@ def placed(points: NDArray, normals: NDArray) -> tuple[NDArray[np.float64], NDAr
     reach = np.sqrt(np.square(away).sum(1))
     most = float(reach.max(initial=0.0)) or 1.0
     one = unit(away[_first_of_the_greatest(reach)])
-    off = away - (away @ one)[:, None] * one
+    off = away - np.einsum("nx,x->n", away, one)[:, None] * one
     two = unit(off[_first_of_the_greatest(np.square(off).sum(1))])
     axes = np.stack([one, two, np.cross(one, two)], 1)
-    return away @ axes / (2 * most), normals @ axes
+    return _turned(away, axes / (2 * most)), _turned(normals, axes)
 
 
 def _first_of_the_greatest(values: NDArray) -> int:
@@ -73,7 +73,12 @@ def _first_of_the_greatest(values: NDArray) -> int:
 
 def curves(places: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """For each pass, indices (N,) that walk the points (N, 3), `placed`, along a curve."""
-    return morton_order(places), morton_order(places @ _TURN)
+    return morton_order(places), morton_order(_turned(places, _TURN))
+
+
+def _turned(vectors: NDArray, axes: NDArray) -> NDArray[np.float64]:
+    """vectors (N, 3) @ axes (3, 3), not by BLAS: its threads would spin for a while on cores that trace rays."""
+    return np.einsum("nx,xy->ny", vectors, axes)
 
 
 def filtered(places: NDArray, normals: NDArray, orders: Sequence[NDArray], blocked: NDArray[np.float32],
