@@ -18,13 +18,12 @@ from . import sampling
 from . import spherical_harmonics as sh
 from .geometry import TriangleMesh
 from .raycast import Occluders
-from .workers import results
+from .workers import product, results
 
 SETS = 16
 MAX_RAYS = 4096
 RAYS_PER_JOB = 1 << 16  # about 15 ms of one thread: short enough to stop at once, long enough to be efficient
 
-_BLAS_SERIAL = 1 << 18  # multiply-adds up to which OpenBLAS stays on the calling thread
 _TURNED_AT_ONCE = 2048  # points rotated by one worker at a time
 
 
@@ -104,11 +103,11 @@ class BlockedEstimator:
         """Worker: (n, K) sums of Y_k over the blocked ones of these directions at these points."""
         frames = self._frames(points).reshape(-1, 9).astype(np.float32)
         count = len(harmonics)
-        directions = _product(frames, lift).reshape(-1, 3)
+        directions = product(frames, lift).reshape(-1, 3)
         origins = np.repeat(self._origins[points], count, axis=0)
         free = self._occluders.blocked(origins, directions)  # 0 blocked, -1 free
         blocked = np.add(free, 1, dtype=np.float64).reshape(-1, count)
-        return _product(blocked, harmonics)
+        return product(blocked, harmonics)
 
     def means(self, points: NDArray, sums: NDArray, start: int, stop: int) -> NDArray[np.float64]:
         """Blocked part (n, K) in the local frame, from sums over directions start..stop.
@@ -157,20 +156,6 @@ class BlockedEstimator:
 
     def _frames(self, points: NDArray) -> NDArray[np.float64]:
         return sampling.frames(self._normals[points], self._angles[points].astype(np.float64))
-
-
-def _product(a: NDArray, b: NDArray) -> NDArray:
-    """a (n, p) @ b (p, q) in pieces too small for BLAS to spread over threads of its own.
-
-    The workers already use every core; BLAS's threads would only wait for each other.
-    """
-    (count, inner), outer = a.shape, b.shape[1]
-    rows = max(1, _BLAS_SERIAL // (inner * outer))
-    whole = count - count % rows
-    out = np.empty((count, outer), a.dtype)
-    np.matmul(a[:whole].reshape(-1, rows, inner), b, out=out[:whole].reshape(-1, rows, outer))
-    np.matmul(a[whole:], b, out=out[whole:])
-    return out
 
 
 def morton_order(points: NDArray) -> NDArray[np.int64]:

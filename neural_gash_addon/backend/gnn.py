@@ -26,10 +26,10 @@ from . import spherical_harmonics as sh
 from .conformal import DIRECTION_COUNT
 from .geometry import TriangleMesh
 from .voxels import Pyramid
+from .workers import BLAS_SERIAL
 
 ORDER = 5              # bands that the network gives
 CHUNK = 4096           # points at a time, at most: many, as threads wait for each other between calls of NumPy
-_BLAS_SERIAL = 1 << 18  # multiply-adds up to which OpenBLAS stays on the calling thread
 _COLUMNS = 32          # of values at a time, at least: with fewer, reading the weights takes the time
 _BLEND = (-0.4, -0.6)  # heights of the normal between which the frame's pole changes
 _OVER = np.diag([1.0, -1.0, -1.0])  # half a turn about e_x
@@ -82,14 +82,11 @@ def _layer(network: Network, name: str, values: NDArray[np.float32]) -> NDArray[
 
 
 def _product(weight: NDArray[np.float32], values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """weight (outputs, inputs) @ values (inputs, n) in pieces too small for BLAS to spread over threads of its own.
-
-    Those would wait for each other, and spin meanwhile on the cores that the other points want.
-    """
+    """weight (outputs, inputs) @ values (inputs, n), as `workers.product`, in tiles: neither side is small."""
     (outputs, inputs), count = weight.shape, values.shape[1]
     rows = next(rows for rows in range(outputs, 0, -1)
-                if outputs % rows == 0 and (rows * inputs * _COLUMNS <= _BLAS_SERIAL or rows == 1))
-    columns = min(count, max(_BLAS_SERIAL // (rows * inputs), 1))
+                if outputs % rows == 0 and (rows * inputs * _COLUMNS <= BLAS_SERIAL or rows == 1))
+    columns = min(count, max(BLAS_SERIAL // (rows * inputs), 1))
     out = np.empty((outputs, count), np.float32)
     tiles, parts = weight.reshape(-1, 1, rows, inputs), out.reshape(-1, rows, count)
     whole = count - count % max(columns, 1)

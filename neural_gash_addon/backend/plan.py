@@ -26,6 +26,7 @@ from .embree_bake import RATE
 from .estimator import MAX_RAYS, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
 from .raycast import Geometry, Occluders
+from .workers import product
 
 PILOT_POINTS = 256           # or a 32nd of them all, if that is less, but at least
 _FEWEST = 96
@@ -77,7 +78,7 @@ def nothing_blocks(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> bool:
     level = _LEVEL * float(np.ptp(vertices, axis=0).max())
     some, few = points[::len(points) // 32 + 1], vertices[::len(vertices) // 4096 + 1]
     height = normals[::len(points) // 32 + 1]
-    if ((height @ few.T).max(1, initial=-np.inf) > (height * some).sum(1) + level).any():
+    if (product(height, few.T).max(1, initial=-np.inf) > (height * some).sum(1) + level).any():
         return False
     vertices = vertices[morton_order(vertices)]
     balls = -(-len(vertices) // _LEAF)
@@ -91,7 +92,7 @@ def nothing_blocks(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> bool:
     for start in range(0, len(points), step):
         here = slice(start, start + step)
         plane = (normals[here] * points[here]).sum(1) + level
-        one, ball = np.nonzero(normals[here] @ centres.T + radii > plane[:, None])
+        one, ball = np.nonzero(product(normals[here], centres.T) + radii > plane[:, None])
         for first in range(0, len(one), 1 << 14):
             part = slice(first, first + (1 << 14))
             reach = np.einsum("pvx,px->pv", leaves[ball[part]], normals[here][one[part]]).max(1)

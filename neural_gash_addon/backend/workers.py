@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Work spread over threads, whose results come as they are done."""
+"""Work spread over threads, whose results come as they are done, and products that do not disturb them."""
 from __future__ import annotations
 
 import os
@@ -9,7 +9,12 @@ from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
 from typing import TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 Result = TypeVar("Result")
+
+BLAS_SERIAL = 1 << 18  # multiply-adds up to which OpenBLAS stays on the calling thread
 
 
 def default_threads() -> int:
@@ -49,3 +54,17 @@ def results(pool: ThreadPoolExecutor, threads: int, jobs: Iterable[tuple], work:
             yield found  # type: ignore[misc]  # None comes only after the end
     finally:
         stop.set()
+
+
+def product(a: NDArray, b: NDArray) -> NDArray:
+    """a (n, p) @ b (p, q) in pieces too small for BLAS to spread over threads of its own.
+
+    The workers already use every core; BLAS's threads would only wait for each other, and spin for a while after.
+    """
+    (count, inner), outer = a.shape, b.shape[1]
+    rows = max(1, BLAS_SERIAL // (inner * outer))
+    whole = count - count % rows
+    out = np.empty((count, outer), a.dtype)
+    np.matmul(a[:whole].reshape(-1, rows, inner), b, out=out[:whole].reshape(-1, rows, outer))
+    np.matmul(a[whole:], b, out=out[whole:])
+    return out
