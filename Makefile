@@ -29,6 +29,7 @@ demo: .venv/ready
 docs-pictures: .venv/ready
 	$(PY) demo/demo.py --out docs
 	$(PY) demo/textures.py --out docs
+	$(PY) demo/glossy.py --out docs
 
 test: .venv/ready
 	$(PY) -m pytest

@@ -67,7 +67,8 @@ def _parser() -> argparse.ArgumentParser:
     bake.add_argument("--object", metavar="NAME", action="append", dest="objects",
                       help="which object; needed where the file has several meshes. Give it again to bake several "
                            "together, which shadow each other")
-    bake.add_argument("--method", choices=list(methods.METHODS), default="embree")
+    bake.add_argument("--method", choices=list(methods.METHODS), default="embree", metavar="METHOD",
+                      help="; ".join(f"{m.name}: {m.label}" for m in methods.METHODS.values()) + " (embree)")
     bake.add_argument("--order", type=int, default=3, help="bands of spherical harmonics, 2 to 5 (3)")
     quality = bake.add_mutually_exclusive_group()
     quality.add_argument("--rays", type=int, help="rays from every point")
@@ -83,14 +84,15 @@ def _parser() -> argparse.ArgumentParser:
     bake.add_argument("--uv-map", metavar="NAME", default="", help="of the mesh, for --texture; else one is made")
     bake.add_argument("--textures", metavar="FOLDER", type=Path, help="write the textures as .exr there, not into OUT")
     bake.add_argument("--half", action="store_true", help="textures of 16 bits a channel instead of 32")
-    bake.add_argument("--gloss", choices=_LOBES, help="show what materials mirror, with this lobe, with --texture")
+    bake.add_argument("--gloss", choices=_LOBES, help="show what materials mirror, with this lobe; with --texture, "
+                      "without --bounces, and best with --order 5")
     bake.add_argument("--out", metavar="OUT.blend", type=Path, help="save the file with the bake in it")
     bake.add_argument("--npz", metavar="OUT.npz", type=Path, help="save points and coefficients")
     bake.add_argument("--png", metavar="OUT.png", type=Path,
                       help="render the object as baked; the scene's camera where there is one (.exr: linear, 32 bits)")
     bake.add_argument("--applied-copy", action="store_true",
                       help="bake a copy with its modifiers applied, where those change the vertices")
-    bake.add_argument("--json", action="store_true", help="print the record as one line of JSON")
+    bake.add_argument("--json", action="store_true", help="print the record as one line of JSON, one for each object")
 
     relight = commands.add_parser("relight", help="render or evaluate a baked file under another light",
                                   epilog=parser.epilog)
@@ -114,7 +116,8 @@ def _side(text: str) -> tuple[str, float]:
             return FIT, 0
         return (DENSITY, float(text[:-2])) if text.endswith("/m") else (RESOLUTION, int(text))
     except ValueError as error:
-        raise argparse.ArgumentTypeError(f"'{text}' is neither a number of texels nor 'fit'") from error
+        raise argparse.ArgumentTypeError(f"'{text}' is no number of texels, nor one a metre like '50/m', "
+                                         "nor 'fit'") from error
 
 
 def main(argv: Sequence[str]) -> int:
@@ -151,6 +154,8 @@ def _bake(arguments: argparse.Namespace) -> tuple[list[dict], str]:
         raise UserError("--uv-map, --textures, --padding, --half and --share belong to a bake with --texture.")
     if arguments.gloss and (arguments.texture is None or arguments.bounces):
         raise UserError("--gloss belongs to a bake with --texture and without --bounces.")
+    if not methods.METHODS[arguments.method].traces and (arguments.rays is not None or arguments.bounces):
+        raise UserError(f"The method '{arguments.method}' traces nothing; leave out --rays and --bounces.")
     if arguments.npz is not None and len(arguments.objects or ()) > 1:
         raise UserError("--npz holds the points of one object; bake several one by one.")
     if arguments.texture is not None and arguments.npz is not None:

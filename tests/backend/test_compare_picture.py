@@ -48,6 +48,16 @@ def test_marks_lie_where_the_numbers_say():
     assert abs(y2 - y1 - down) <= 1 and abs(x0 - compare_picture._LEFT - across) <= 1
 
 
+def test_no_two_methods_have_the_same_colour():
+    """As read off the legend, whose marks are that of each method in its turn."""
+    found = [Measurement(Setting(name, 3), [1.0], rel_l2=0.1) for name in METHODS]
+    image = compare_picture.picture(found, 1000, 0.001, "title", found[0], 0.1)[::-1, :, :3]
+    rows = compare_picture._TOP + 7 + 30 * np.arange(len(METHODS))
+    marks = image[rows, compare_picture._RIGHT + 38]
+    apart = np.abs(marks[:, None] - marks).max(-1)[~np.eye(len(marks), dtype=bool)]
+    assert (marks.min(1) < 0.9).all() and apart.min() > 0.1
+
+
 def test_nothing_measured_still_draws():
     none = [Measurement(Setting("gnn", 3), refused="No."), Measurement(Setting("analytic", 3), [0.0], rel_l2=0.0)]
     assert np.isfinite(compare_picture.picture(none, 0, 0.0, "t", none[1], 1.0)).all()

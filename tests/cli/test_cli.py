@@ -163,6 +163,8 @@ KEEP = "--json"
     ("rays must be", ("{blend}", "--rays", "0", KEEP)),
     ("rays must be", ("{blend}", "--rays", "99999999999", KEEP)),
     ("order must be", ("{blend}", "--order", "6", KEEP)),
+    ("traces nothing", ("{blend}", "--method", "analytic", "--bounces", "2", KEEP)),
+    ("traces nothing", ("{blend}", "--method", "gnn", "--rays", "8", KEEP)),
     ("cannot be written to", ("{blend}", "--npz", "{folder}/missing/a.npz")),
     ("cannot be written to", ("{blend}", "--out", "{folder}/notes.txt/a.blend")),
     ("is a folder", ("{blend}", "--png", "{folder}/folder.png")),

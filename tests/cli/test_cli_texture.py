@@ -117,7 +117,7 @@ def test_a_tolerance_that_the_file_holds_does_not_count(run, blend, tmp_path):
 
 def test_sizes_folders_and_strengths_that_cannot_be_are_said(run, refused, blend, tmp_path):
     out = tmp_path / "out.blend"
-    assert "neither a number of texels nor 'fit'" in run("bake", blend, "--texture", "big", "--out", out).stderr
+    assert "like '50/m', nor 'fit'" in run("bake", blend, "--texture", "big", "--out", out).stderr
     assert "is a file" in refused("bake", blend, "--object", "Ring", "--texture", 64, "--textures", blend, "--out", out)
     assert not list(tmp_path.iterdir())   # no tiles: it was said before the bake
     assert run("bake", blend, "--object", "Ring", "--texture", 64, "--rays", 16, "--out", out).returncode == 0
