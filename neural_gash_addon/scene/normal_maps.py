@@ -11,7 +11,7 @@ from ..backend.geometry import Surface
 from ..backend.texels import NormalMap
 from .evaluation import evaluated
 from .frames import Array
-from .preview import shader_node
+from .preview import shader_node, shown_material
 from .uv_maps import read_uv
 from .world import linear_pixels
 
@@ -27,8 +27,9 @@ def read_normal_maps(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, surf
     Raises:
         UserError: a normal map's image or UV map cannot be read.
     """
-    found = [(slot, node) for slot, item in enumerate(obj.material_slots)
-             if (node := _normal_node(item.material)) is not None]
+    materials = [shown_material(slot.material) for slot in obj.material_slots]
+    found = [(slot, material, node) for slot, material in enumerate(materials)
+             if material is not None and (node := _normal_node(material)) is not None]
     if not found:
         return []
     slots = np.zeros(int(surface.corner_faces.max()) + 1, np.int32)
@@ -37,23 +38,22 @@ def read_normal_maps(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, surf
         mesh = copy.to_mesh()
         try:
             mesh.polygons.foreach_get("material_index", slots)
-            slots = np.clip(slots, 0, len(obj.material_slots) - 1)
-            for slot, node in found:
+            slots = np.clip(slots, 0, len(materials) - 1)
+            for slot, material, node in found:
                 name = node.uv_map or _rendered_uv(obj.data)
                 if name not in obj.data.uv_layers:
                     wanted = f"reads the UV map '{name}'" if name else "needs a UV map"
-                    raise UserError(f"The normal map of the material '{obj.material_slots[slot].material.name}' "
+                    raise UserError(f"The normal map of the material '{material.name}' "
                                     f"{wanted}, which '{obj.name}' does not have.")
                 uv = read_uv(obj.data, name)
-                maps.append(NormalMap(_pixels(obj.material_slots[slot].material, node),
-                                      float(node.inputs["Strength"].default_value),
+                maps.append(NormalMap(_pixels(material, node), float(node.inputs["Strength"].default_value),
                                       slots[surface.polygons] == slot, uv, _tangents(obj.name, mesh, name, matrix)))
         finally:
             copy.to_mesh_clear()
     return maps
 
 
-def _normal_node(material: bpy.types.Material | None) -> bpy.types.Node | None:
+def _normal_node(material: bpy.types.Material) -> bpy.types.Node | None:
     """The Normal Map node that feeds the shader of a material, if it is one that reads an image by UV."""
     shader = shader_node(material)
     if shader is None or not shader.inputs["Normal"].is_linked:

@@ -318,3 +318,14 @@ def test_flipped_uvs_give_the_same_bake_flipped(make, texture):
         found.append(pixels[:, ::flip])
     assert np.abs(found[0]).max() > 0.2
     np.testing.assert_allclose(found[0], found[1], atol=0.01)
+
+
+def test_a_normal_map_counts_again_while_the_preview_is_on(make, texture):
+    obj = make(*FLOOR)
+    obj.data.uv_layers.new(name="Mine")
+    _normal_map(obj, 0.8, "Mine")
+    _bake(obj)
+    before = _pixels(_images(obj)[0])
+    _bake(obj)  # the preview's material is in the slot now
+    np.testing.assert_array_equal(_pixels(_images(obj)[0]), before)
+    assert np.abs(before[16, 16, [1, 3]]).min() > 0.1  # bent: a flat floor's are zero
