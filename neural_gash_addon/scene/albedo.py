@@ -16,9 +16,9 @@ from .preview import COLOUR_SOCKETS, DEFAULT_ROUGHNESS, shader_node, shown_mater
 from .world import linear_pixels
 
 Finish = tuple[NDArray[np.float64], list[Picture]]  # (F, 7) of triangles, and images that say it from place to place
+Images = dict[int, NDArray[np.float32]]  # session uid of an image -> (H, W, 3) scene-linear
 
-
-def triangle_finish(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArray[np.int32]) -> Finish:
+def triangle_finish(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArray[np.int32], known: Images) -> Finish:
     """Of the triangles with these face corners (F, 3): albedo, specular colour (linear) and roughness (F, 7).
 
     A plain colour or an image by UV counts; where other nodes make the colour, the socket's own value
@@ -26,6 +26,7 @@ def triangle_finish(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArra
 
     Args:
         obj: evaluated, or not. mesh: its geometry, whose loop triangles have been computed.
+        known: images that have been read, to which others are added: many objects may share a large one.
     Returns:
         The means over each triangle, and the images.
     """
@@ -39,7 +40,7 @@ def triangle_finish(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArra
     for number, material in enumerate(materials or [None]):
         here = np.flatnonzero(slot_of == number)
         if len(here):
-            out[here], found = _finish(material, mesh, corners[here])
+            out[here], found = _finish(material, mesh, corners[here], known)
             pictures += [replace(picture, triangles=here) for picture in found]
     out = np.clip(np.nan_to_num(out), 0, 1)
     for picture in pictures:
@@ -47,7 +48,7 @@ def triangle_finish(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArra
     return out, pictures
 
 
-def _finish(material: bpy.types.Material | None, mesh: bpy.types.Mesh, corners: NDArray) -> Finish:
+def _finish(material: bpy.types.Material | None, mesh: bpy.types.Mesh, corners: NDArray, known: Images) -> Finish:
     """(7,) of one material, and the images that say it better, of these triangles (f, 3)."""
     node = shader_node(material)
     out, pictures = np.empty(7), []
@@ -59,11 +60,11 @@ def _finish(material: bpy.types.Material | None, mesh: bpy.types.Mesh, corners: 
         out[:3] = _value(socket)
         if "Metallic" in node.inputs and not node.inputs["Metallic"].is_linked:
             metallic = node.inputs["Metallic"].default_value
-        pictures = _pictures(socket, mesh, corners, np.arange(6), np.arange(6) % 3,
+        pictures = _pictures(socket, mesh, corners, known, np.arange(6), np.arange(6) % 3,
                              np.repeat([1 - metallic, metallic], 3), np.repeat([0.0, SPECULAR * (1 - metallic)], 3))
         if "Roughness" in node.inputs:
             out[6] = _value(node.inputs["Roughness"])[0]
-            pictures += _pictures(node.inputs["Roughness"], mesh, corners, *np.array([[6], [0], [1], [0]]))
+            pictures += _pictures(node.inputs["Roughness"], mesh, corners, known, *np.array([[6], [0], [1], [0]]))
     out[3:6] = SPECULAR + metallic * (out[:3] - SPECULAR)
     out[:3] *= 1 - metallic
     return out, pictures
@@ -77,8 +78,8 @@ def _value(socket: bpy.types.NodeSocket) -> NDArray[np.float64]:
     return np.resize(np.array(socket.default_value, float), 4)[:3]
 
 
-def _pictures(socket: bpy.types.NodeSocket, mesh: bpy.types.Mesh, corners: NDArray, columns: NDArray,
-              channels: NDArray, gain: NDArray, offset: NDArray) -> list[Picture]:
+def _pictures(socket: bpy.types.NodeSocket, mesh: bpy.types.Mesh, corners: NDArray, known: Images,
+              columns: NDArray, channels: NDArray, gain: NDArray, offset: NDArray) -> list[Picture]:
     """The image that an input takes its value from by UV, if it does."""
     source = socket.links[0].from_node if socket.is_linked else None
     if source is None or source.type != "TEX_IMAGE" or source.image is None:
@@ -86,13 +87,16 @@ def _pictures(socket: bpy.types.NodeSocket, mesh: bpy.types.Mesh, corners: NDArr
     layer = _uv_layer(source, mesh)
     if layer is None:
         return []
+    uid = source.image.session_uid
     try:
-        pixels = np.nan_to_num(linear_pixels(source.image)[..., :3])
+        if uid not in known:
+            known[uid] = np.nan_to_num(linear_pixels(source.image)[..., :3])
     except UserError:
         return []  # pink on screen, too
     uv = np.empty((len(layer.uv), 2), np.float32)
     layer.uv.foreach_get("vector", uv.ravel())
-    return [Picture(np.arange(len(corners)), uv[corners].astype(np.float64), pixels, columns, channels, gain, offset)]
+    return [Picture(np.arange(len(corners)), uv[corners].astype(np.float64), known[uid], columns, channels, gain,
+                    offset)]
 
 
 def _uv_layer(texture: bpy.types.Node, mesh: bpy.types.Mesh) -> bpy.types.MeshUVLoopLayer | None:

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What materials of others may be made of, and what a bake with bounces reads of them."""
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+FLOOR = ([(-2, -2, 0), (2, -2, 0), (2, 2, 0), (-2, 2, 0)], [(0, 1, 2, 3)])
+LID = ([(-1, -1, 0.5), (1, -1, 0.5), (1, 1, 0.5), (-1, 1, 0.5)], [(0, 1, 2, 3)])
+SQUARE = ((0, 0), (1, 0), (1, 1), (0, 1))
+
+
+def _unwrap(obj, uv=SQUARE):
+    obj.data.uv_layers.new(name="Mine").uv.foreach_set("vector", np.array(uv, np.float32).ravel())
+
+
+def _image(colour, side=4):
+    image = bpy.data.images.new("colours", side, side, alpha=True, float_buffer=True, is_data=True)
+    image.pixels.foreach_set(np.tile(np.array(colour, np.float32), side * side))
+    return image
+
+
+def _paint(obj, image, output="Color", socket="Base Color"):
+    """A dull grey material whose socket has an image; the image's node."""
+    material = bpy.data.materials.new(obj.name)
+    material.use_nodes = True
+    tree = material.node_tree
+    shader = tree.nodes["Principled BSDF"]
+    shader.inputs["Base Color"].default_value = (0.3, 0.3, 0.3, 1)
+    node = tree.nodes.new("ShaderNodeTexImage")
+    node.image = image
+    tree.links.new(node.outputs[output], shader.inputs[socket])
+    obj.data.materials.append(material)
+    return node
+
+
+def _finish(obj, mode="VISIBLE"):
+    from neural_gash_addon.scene.read import read_finish
+    bpy.context.view_layer.update()
+    return read_finish(obj, mode, bpy.context.evaluated_depsgraph_get())
+
+
+def test_an_image_of_many_objects_is_read_once(make):
+    floor = make(*FLOOR, "Floor")
+    _unwrap(floor)
+    _paint(floor, _image((0.9, 0.1, 0.1, 1)))
+    for number in range(3):
+        lid = make(*LID, f"Lid {number}")
+        _unwrap(lid)
+        lid.data.materials.append(floor.data.materials[0])
+    finish, pictures = _finish(floor)
+    np.testing.assert_allclose(finish[:, :3], np.tile([0.9, 0.1, 0.1], (8, 1)), atol=1e-6)
+    assert len(pictures) == 4 and len({id(picture.pixels) for picture in pictures}) == 1
