@@ -13,7 +13,7 @@ from ..backend.pictures import Picture
 from .gloss_nodes import SPECULAR
 from .nodes import DEFAULT_ALBEDO
 from .preview import COLOUR_SOCKETS, DEFAULT_ROUGHNESS, shader_node, shown_material
-from .world import linear_pixels
+from .world import feeding, linear_pixels
 
 Finish = tuple[NDArray[np.float64], list[Picture]]  # (F, 7) of triangles, and images that say it from place to place
 Images = dict[int, NDArray[np.float32]]  # session uid of an image -> (H, W, 3) scene-linear
@@ -72,17 +72,18 @@ def _finish(material: bpy.types.Material | None, mesh: bpy.types.Mesh, corners: 
 
 def _value(socket: bpy.types.NodeSocket) -> NDArray[np.float64]:
     """(3,) of an input, a colour or a number."""
-    source = socket.links[0].from_node if socket.is_linked else None
-    if source is not None and source.type == "RGB":
-        return np.array(source.outputs[0].default_value[:3])
+    output = feeding(socket)
+    if output is not None and output.node.type == "RGB":
+        return np.array(output.default_value[:3])
     return np.resize(np.array(socket.default_value, float), 4)[:3]
 
 
 def _pictures(socket: bpy.types.NodeSocket, mesh: bpy.types.Mesh, corners: NDArray, known: Images,
               columns: NDArray, channels: NDArray, gain: NDArray, offset: NDArray) -> list[Picture]:
     """The image that an input takes its value from by UV, if it does."""
-    source = socket.links[0].from_node if socket.is_linked else None
-    if source is None or source.type != "TEX_IMAGE" or source.image is None:
+    output = feeding(socket)
+    source = output.node if output is not None and output.name == "Color" else None
+    if source is None or source.type != "TEX_IMAGE" or source.image is None or source.projection != "FLAT":
         return []
     layer = _uv_layer(source, mesh)
     if layer is None:
@@ -101,11 +102,11 @@ def _pictures(socket: bpy.types.NodeSocket, mesh: bpy.types.Mesh, corners: NDArr
 
 def _uv_layer(texture: bpy.types.Node, mesh: bpy.types.Mesh) -> bpy.types.MeshUVLoopLayer | None:
     """The UV map that an Image Texture node reads; None where its mapping is made otherwise."""
-    if texture.inputs["Vector"].is_linked:
-        node = texture.inputs["Vector"].links[0].from_node
+    output = feeding(texture.inputs["Vector"])
+    if output is not None:
+        node = output.node
         if node.type == "UVMAP" and node.uv_map:
             return mesh.uv_layers.get(node.uv_map)
-        if node.type != "UVMAP" and not (node.type == "TEX_COORD"
-                                         and texture.inputs["Vector"].links[0].from_socket.name == "UV"):
+        if node.type != "UVMAP" and not (node.type == "TEX_COORD" and output.name == "UV"):
             return None
     return next((layer for layer in mesh.uv_layers if layer.active_render), None)

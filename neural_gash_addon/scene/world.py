@@ -83,7 +83,13 @@ def _background(world: bpy.types.World | None, order: int) -> Array:
 
 
 def _source(socket: bpy.types.NodeSocket) -> bpy.types.Node | None:
-    """The node that feeds an input, through reroutes and muted nodes' passes; None where nothing does."""
+    """The node of `feeding`."""
+    output = feeding(socket)
+    return output.node if output else None
+
+
+def feeding(socket: bpy.types.NodeSocket) -> bpy.types.NodeSocket | None:
+    """The output that feeds an input, through reroutes and muted nodes' passes; None where nothing does."""
     while socket.is_linked:
         link = socket.links[0]
         node = link.from_node
@@ -97,7 +103,7 @@ def _source(socket: bpy.types.NodeSocket) -> bpy.types.Node | None:
                 return None
             socket = passes[0]
         else:
-            return node
+            return link.from_socket
     return None
 
 

@@ -2,8 +2,6 @@
 """What materials of others may be made of, and what a bake with bounces reads of them."""
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
@@ -55,3 +53,31 @@ def test_an_image_of_many_objects_is_read_once(make):
     finish, pictures = _finish(floor)
     np.testing.assert_allclose(finish[:, :3], np.tile([0.9, 0.1, 0.1], (8, 1)), atol=1e-6)
     assert len(pictures) == 4 and len({id(picture.pixels) for picture in pictures}) == 1
+
+
+def test_reroutes_lead_to_the_image(make):
+    floor = make(*FLOOR)
+    _unwrap(floor)
+    node = _paint(floor, _image((0.9, 0.1, 0.2, 1)))
+    tree = floor.data.materials[0].node_tree
+    reroute, socket = tree.nodes.new("NodeReroute"), tree.nodes["Principled BSDF"].inputs["Base Color"]
+    tree.links.new(node.outputs["Color"], reroute.inputs[0])
+    tree.links.new(reroute.outputs[0], socket)
+    np.testing.assert_allclose(_finish(floor)[0][:, :3], [(0.9, 0.1, 0.2)] * 2, atol=1e-6)
+    node.mute = True
+    np.testing.assert_allclose(_finish(floor)[0][:, :3], 0.3, atol=1e-6)
+
+
+def test_the_alpha_of_an_image_is_not_its_colour(make):
+    floor = make(*FLOOR)
+    _unwrap(floor)
+    _paint(floor, _image((0.1, 0.1, 0.1, 0.9)), "Alpha", "Roughness")
+    assert _finish(floor)[0][:, 6] == pytest.approx(0.5)  # the socket's own, as of all that is not read
+
+
+def test_images_that_are_projected_otherwise_are_not_read_by_uv(make):
+    floor = make(*FLOOR)
+    _unwrap(floor)
+    node = _paint(floor, _image((0.9, 0.1, 0.2, 1)))
+    node.projection = "BOX"
+    np.testing.assert_allclose(_finish(floor)[0][:, :3], 0.3, atol=1e-6)
