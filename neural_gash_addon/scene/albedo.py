@@ -13,6 +13,7 @@ from ..backend.pictures import Picture
 from .gloss_nodes import SPECULAR
 from .nodes import DEFAULT_ALBEDO
 from .preview import COLOUR_SOCKETS, DEFAULT_ROUGHNESS, shader_node, shown_material
+from .uv_maps import own_uv_name
 from .world import feeding, linear_pixels
 
 Finish = tuple[NDArray[np.float64], list[Picture]]  # (F, 7) of triangles, and images that say it from place to place
@@ -59,7 +60,7 @@ def _finish(material: bpy.types.Material | None, mesh: bpy.types.Mesh, corners: 
         socket = node.inputs[COLOUR_SOCKETS[node.type]]
         out[:3] = _value(socket)
         if "Metallic" in node.inputs and not node.inputs["Metallic"].is_linked:
-            metallic = node.inputs["Metallic"].default_value
+            metallic = float(np.clip(np.nan_to_num(node.inputs["Metallic"].default_value), 0, 1))
         pictures = _pictures(socket, mesh, corners, known, np.arange(6), np.arange(6) % 3,
                              np.repeat([1 - metallic, metallic], 3), np.repeat([0.0, SPECULAR * (1 - metallic)], 3))
         if "Roughness" in node.inputs:
@@ -109,4 +110,5 @@ def _uv_layer(texture: bpy.types.Node, mesh: bpy.types.Mesh) -> bpy.types.MeshUV
             return mesh.uv_layers.get(node.uv_map)
         if node.type != "UVMAP" and not (node.type == "TEX_COORD" and output.name == "UV"):
             return None
-    return next((layer for layer in mesh.uv_layers if layer.active_render), None)
+    own = own_uv_name(mesh)  # the rendered one only where the person has none: was not there when it was baked
+    return next((layer for layer in mesh.uv_layers if layer.active_render and layer.name != own), None)

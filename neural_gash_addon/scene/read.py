@@ -184,7 +184,7 @@ def read_finish(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph
     with evaluated(obj, depsgraph) as copy:
         mesh = copy.to_mesh()
         try:
-            own = triangle_finish(obj, mesh, _triangle_corners(mesh), known)
+            own = triangle_finish(copy, mesh, _triangle_corners(mesh), known)
         finally:
             copy.to_mesh_clear()
     values: list[Array] = []

@@ -81,3 +81,42 @@ def test_images_that_are_projected_otherwise_are_not_read_by_uv(make):
     node = _paint(floor, _image((0.9, 0.1, 0.2, 1)))
     node.projection = "BOX"
     np.testing.assert_allclose(_finish(floor)[0][:, :3], 0.3, atol=1e-6)
+
+
+def test_materials_that_geometry_nodes_set_count_on_what_is_baked(make):
+    floor, donor = make(*FLOOR), make(*LID, "Donor")
+    _paint(donor, None)
+    tree = bpy.data.node_groups.new("Painter", "GeometryNodeTree")
+    for way in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+    first, last = tree.nodes.new("NodeGroupInput"), tree.nodes.new("NodeGroupOutput")
+    painter = tree.nodes.new("GeometryNodeSetMaterial")
+    painter.inputs["Material"].default_value = donor.data.materials[0]
+    tree.links.new(first.outputs[0], painter.inputs["Geometry"])
+    tree.links.new(painter.outputs[0], last.inputs[0])
+    floor.modifiers.new("Painter", "NODES").node_group = tree
+    np.testing.assert_allclose(_finish(floor, "SELF")[0][:, :3], 0.3, atol=1e-6)
+
+
+@pytest.mark.parametrize("metallic", [np.nan, np.inf, -3])
+def test_metal_that_is_no_part_of_1_gives_numbers(make, metallic):
+    floor = make(*FLOOR)
+    _unwrap(floor)
+    _paint(floor, _image((0.9, 0.1, 0.2, 1)))
+    shader = floor.data.materials[0].node_tree.nodes["Principled BSDF"]
+    shader.inputs["Metallic"].default_value = metallic
+    finish, (picture,) = _finish(floor)
+    for values in (finish, picture.lookups()):
+        assert np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1
+
+
+def test_the_uv_map_of_the_bake_is_not_what_images_lie_on(make, settings):
+    """A mesh without UVs shows no image by UV, and the bake's own map must not change that, or its age."""
+    from neural_gash_addon.scene import staleness
+    settings.target, settings.side, settings.bounces, settings.occluders = "TEXTURE", 32, 2, "VISIBLE"
+    _paint(make(*LID, "Lid"), None)
+    floor = make(*FLOOR)
+    _paint(floor, _image((0.9, 0.1, 0.2, 1)))
+    assert bpy.ops.neural_gash.bake() == {"FINISHED"}
+    assert [layer.name for layer in floor.data.uv_layers] == ["PRT"] and staleness.check(floor)
+    np.testing.assert_allclose(_finish(floor)[0][:2, :3], 0.3, atol=1e-6)
