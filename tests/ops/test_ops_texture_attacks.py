@@ -2,6 +2,7 @@
 """What a person may do to texture bakes: names that clash, UV maps that go, numbers that are none."""
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
@@ -329,3 +330,22 @@ def test_a_normal_map_counts_again_while_the_preview_is_on(make, texture):
     _bake(obj)  # the preview's material is in the slot now
     np.testing.assert_array_equal(_pixels(_images(obj)[0]), before)
     assert np.abs(before[16, 16, [1, 3]]).min() > 0.1  # bent: a flat floor's are zero
+
+
+def test_a_fitted_texture_is_small_where_next_to_no_light_comes(make, texture):
+    """Some rays slip through where the box's faces meet; they are no shadows that ask for texels."""
+    make(name="Box").scale = (4, 4, 4)
+    floor = make(*FLOOR)
+    texture.sizing, texture.tolerance, texture.occluders, texture.rays = "FIT", 0.02, "VISIBLE", 64
+    _bake(floor)  # to 4096 texels a side, once, in two minutes
+    assert json.loads(floor.data["neural_gash"])["side"] <= 64
+
+
+def test_a_record_file_that_no_bake_made_is_kept(make, texture, tmp_path, refused, snapshot):
+    texture.texture_folder = str(tmp_path)
+    make(*FLOOR, name="Floor")
+    before = snapshot()
+    (tmp_path / "Floor_prt.json").write_text('{"mine": 1}')
+    assert "Floor_prt.json' that no bake made" in refused(bpy.ops.neural_gash.bake)
+    assert snapshot() == before and [p.name for p in tmp_path.iterdir()] == ["Floor_prt.json"]
+    assert (tmp_path / "Floor_prt.json").read_text() == '{"mine": 1}'
