@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..backend.errors import UserError
@@ -84,31 +85,60 @@ def _pictures(socket: bpy.types.NodeSocket, mesh: bpy.types.Mesh, corners: NDArr
     """The image that an input takes its value from by UV, if it does."""
     output = feeding(socket)
     source = output.node if output is not None and output.name == "Color" else None
-    if source is None or source.type != "TEX_IMAGE" or source.image is None or source.projection != "FLAT":
+    if source is None or source.type != "TEX_IMAGE" or source.image is None:
         return []
-    layer = _uv_layer(source, mesh)
-    if layer is None:
+    uv = image_uv(source, mesh)
+    if uv is None:
         return []
     uid = source.image.session_uid
     try:
         if uid not in known:
             known[uid] = np.nan_to_num(linear_pixels(source.image)[..., :3])
     except UserError:
-        return []  # pink on screen, too
+        return []  # pink on screen, or not one image
+    return [Picture(np.arange(len(corners)), uv[corners], known[uid], columns, channels, gain, offset,
+                    source.extension)]
+
+
+def image_uv(texture: bpy.types.Node, mesh: bpy.types.Mesh) -> NDArray[np.float64] | None:
+    """(C, 2) at which each face corner has an Image Texture node looked up; None where no UV map says it."""
+    if texture.projection != "FLAT":
+        return None
+    output = feeding(texture.inputs["Vector"])
+    placing: NDArray | None = np.eye(4)
+    if output is not None and output.node.type == "MAPPING":
+        placing = _placing(output.node)
+        output = feeding(output.node.inputs["Vector"])
+        if output is None:
+            return None
+    layer = _uv_layer(output, mesh)
+    if layer is None or placing is None:
+        return None
     uv = np.empty((len(layer.uv), 2), np.float32)
     layer.uv.foreach_get("vector", uv.ravel())
-    return [Picture(np.arange(len(corners)), uv[corners].astype(np.float64), known[uid], columns, channels, gain,
-                    offset)]
+    found: NDArray[np.float64] = np.where(np.isfinite(uv), uv, 0) @ placing[:2, :2].T + placing[:2, 3]
+    return found
 
 
-def _uv_layer(texture: bpy.types.Node, mesh: bpy.types.Mesh) -> bpy.types.MeshUVLoopLayer | None:
-    """The UV map that an Image Texture node reads; None where its mapping is made otherwise."""
-    output = feeding(texture.inputs["Vector"])
+def _placing(mapping: bpy.types.Node) -> NDArray[np.float64] | None:
+    """(4, 4) of a Mapping node; None where it is none that numbers make."""
+    if mapping.vector_type not in ("POINT", "TEXTURE") or any(socket.is_linked for socket in mapping.inputs[1:]):
+        return None
+    location, rotation, scale = (mapping.inputs[name] for name in ("Location", "Rotation", "Scale"))
+    matrix = np.array(Matrix.LocRotScale(location.default_value, rotation.default_value, scale.default_value))
+    if not np.isfinite(matrix).all():
+        return None
+    if mapping.vector_type == "POINT":
+        return matrix
+    return np.linalg.inv(matrix) if np.linalg.det(matrix) else None
+
+
+def _uv_layer(output: bpy.types.NodeSocket | None, mesh: bpy.types.Mesh) -> bpy.types.MeshUVLoopLayer | None:
+    """The UV map that an output gives, or that serves where none is linked; None where it gives something else."""
     if output is not None:
-        node = output.node
-        if node.type == "UVMAP" and node.uv_map:
-            return mesh.uv_layers.get(node.uv_map)
-        if node.type != "UVMAP" and not (node.type == "TEX_COORD" and output.name == "UV"):
+        if output.node.type == "UVMAP" and output.node.uv_map:
+            return mesh.uv_layers.get(output.node.uv_map)
+        if output.node.type != "UVMAP" and not (output.node.type == "TEX_COORD" and output.name == "UV"):
             return None
     own = own_uv_name(mesh)  # the rendered one only where the person has none: was not there when it was baked
     return next((layer for layer in mesh.uv_layers if layer.active_render and layer.name != own), None)

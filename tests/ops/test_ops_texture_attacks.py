@@ -349,3 +349,31 @@ def test_a_record_file_that_no_bake_made_is_kept(make, texture, tmp_path, refuse
     assert "Floor_prt.json' that no bake made" in refused(bpy.ops.neural_gash.bake)
     assert snapshot() == before and [p.name for p in tmp_path.iterdir()] == ["Floor_prt.json"]
     assert (tmp_path / "Floor_prt.json").read_text() == '{"mine": 1}'
+
+
+@pytest.mark.parametrize("by", ["its UV map", "a mapping"])
+def test_a_normal_map_is_looked_up_where_its_image_lies(make, texture, by):
+    """Whose left half is flat: the Normal Map node's own UV map is that of the tangents only."""
+    obj = make(*FLOOR)
+    square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
+    for name, uv in (("Whole", square), ("Left", 0.3 * square + 0.1)):
+        obj.data.uv_layers.new(name=name).uv.foreach_set("vector", uv.ravel())
+    _normal_map(obj, 0.5, "Whole")
+    tree = obj.data.materials[0].node_tree
+    node = next(n for n in tree.nodes if n.type == "TEX_IMAGE")
+    pixels = np.tile(np.array([0.5, 0.5, 1, 1], np.float32), (4, 4, 1))
+    pixels[:, 2:, 0] = 0.9
+    node.image.pixels.foreach_set(pixels.ravel())
+    _bake(obj)
+    assert np.abs(_pixels(_images(obj)[0])[..., 3]).max() > 0.1  # the right half is bent
+    if by == "a mapping":
+        place, mapping = tree.nodes.new("ShaderNodeTexCoord"), tree.nodes.new("ShaderNodeMapping")
+        mapping.inputs["Location"].default_value, mapping.inputs["Scale"].default_value = (0.1,) * 3, (0.3,) * 3
+        tree.links.new(place.outputs["UV"], mapping.inputs["Vector"])
+        tree.links.new(mapping.outputs["Vector"], node.inputs["Vector"])
+    else:
+        other = tree.nodes.new("ShaderNodeUVMap")
+        other.uv_map = "Left"
+        tree.links.new(other.outputs["UV"], node.inputs["Vector"])
+    _bake(obj)
+    assert np.abs(_pixels(_images(obj)[0])[16, 8:24, 3]).max() < 1e-5
