@@ -377,3 +377,15 @@ def test_a_normal_map_is_looked_up_where_its_image_lies(make, texture, by):
         tree.links.new(other.outputs["UV"], node.inputs["Vector"])
     _bake(obj)
     assert np.abs(_pixels(_images(obj)[0])[16, 8:24, 3]).max() < 1e-5
+
+
+def test_glossy_bounces_of_a_bright_light_are_numbers_in_16_bits_too(make, texture):
+    world = bpy.context.scene.world = bpy.data.worlds.new("Sky")
+    world.color = (1e6, 1e6, 1e6)
+    texture.half, texture.gloss = True, True
+    make([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (0, 1, 1)], [(0, 1, 2, 3), (0, 3, 5, 4)])
+    assert bpy.ops.neural_gash.bake() == bpy.ops.neural_gash.bake_gloss() == {"FINISHED"}
+    obj = bpy.context.object
+    bounced = [_pixels(image) for image in _images(obj, "neural_gash_gloss_images")]
+    assert all(np.isfinite(pixels).all() for pixels in bounced) and np.max(bounced) > 1e5
+    assert _images(obj)[0].use_half_precision
