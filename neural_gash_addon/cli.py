@@ -152,6 +152,8 @@ def _bake(arguments: argparse.Namespace) -> tuple[list[dict], str]:
     if arguments.texture is None and (arguments.uv_map or arguments.textures or arguments.half or arguments.share
                                       or arguments.padding is not None):
         raise UserError("--uv-map, --textures, --padding, --half and --share belong to a bake with --texture.")
+    if arguments.uv_map and arguments.texture[0] == DENSITY:
+        raise UserError("With --uv-map a texture has no texels per metre; give --texture a number of texels, or fit.")
     if arguments.gloss and (arguments.texture is None or arguments.bounces):
         raise UserError("--gloss belongs to a bake with --texture and without --bounces.")
     if not methods.METHODS[arguments.method].traces and (arguments.rays is not None or arguments.bounces):

@@ -16,6 +16,8 @@ from .resolution import MAX_FIT, Trial, fitting_density
 from .unwrap import Atlas, Charts, cut, lay_out
 
 MIN_SIDE, MAX_SIDE = 16, 8192
+_COLLAPSED = 1e-6  # of the texels that a face has for its area on the mean: less is none
+_MOST_LOST = 1e-3  # of a mesh's area, in faces that have none: slivers that nobody sees
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +40,21 @@ class Placed:
 
 def check_part(part: Part) -> None:
     """UserError for a mesh that no texture has room for, whatever else is in it."""
-    if part.uv is not None:
-        check_range(part.uv[part.surface.corners])
-        return
     places = part.surface.positions[part.surface.triangles]
-    if not np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]).any():
-        raise UserError("All faces have an area of zero, so a texture has nothing to show; bake to vertices.")
+    areas = np.linalg.norm(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]), axis=1)
+    if part.uv is None:
+        if not areas.any():
+            raise UserError("All faces have an area of zero, so a texture has nothing to show; bake to vertices.")
+        return
+    uv = np.asarray(part.uv, np.float64)[part.surface.corners]
+    check_range(uv)
+    (a, b), (c, d) = (uv[:, 1] - uv[:, 0]).T, (uv[:, 2] - uv[:, 0]).T
+    room = np.abs(a * d - b * c)
+    lost = room * areas.sum() <= _COLLAPSED * areas * room.sum()
+    if areas[lost].sum() > _MOST_LOST * areas.sum():
+        faces = np.unique(part.surface.polygons[lost & (areas > 0)])
+        raise UserError(f"{len(faces):,} of the faces have no area in the UV map (the first is {faces[0]}), so a "
+                        "texture has no place for them; unwrap them, or let the bake make its own UV map.")
 
 
 def place(parts: Sequence[Part], *, side: int | None = None, texels_per_metre: float | None = None, padding: int = 2,
@@ -62,11 +73,11 @@ def place(parts: Sequence[Part], *, side: int | None = None, texels_per_metre: f
     Raises:
         UserError: sizes out of range, UVs outside the texture or missing room, faces that overlap.
     """
-    for part in parts:
-        check_part(part)
     trials = [part.trial for part in parts if part.trial is not None]
     if not trials:
         _check_side(side, texels_per_metre if parts[0].uv is None else None)
+    for part in parts:
+        check_part(part)
     uvs = [part.uv for part in parts if part.uv is not None]
     if uvs:
         _check_overlaps(parts, uvs, min(side or CHECKED_SIDE, CHECKED_SIDE))

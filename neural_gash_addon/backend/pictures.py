@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .texels import bilinear
+from .texels import REPEAT, bilinear
 
 # where in a triangle an image is looked up: its centre and half-way to its corners
 PLACES = np.array([[4, 4, 4], [8, 2, 2], [2, 8, 2], [2, 2, 8]]) / 12
@@ -19,16 +19,17 @@ class Picture:
     """An image on some triangles, and which of their numbers it gives: offset + gain * channel."""
 
     triangles: NDArray[np.int64]  # (f,) ascending
-    uv: NDArray[np.float64]       # (f, 3, 2) of their corners; the image repeats
+    uv: NDArray[np.float64]       # (f, 3, 2) of their corners
     pixels: NDArray[np.float32]   # (H, W, 3)
     columns: NDArray[np.int64]    # (c,) of the numbers (F, C) of all triangles
     channels: NDArray[np.int64]   # (c,) of the image
     gain: NDArray[np.float64]     # (c,)
     offset: NDArray[np.float64]   # (c,)
+    extension: str = REPEAT       # see `texels.bilinear`
 
     def at(self, rows: NDArray[np.int64], barycentric: NDArray) -> NDArray[np.float64]:
         """Its numbers (n, c) at barycentric coordinates (n, 3) of some of its triangles, rows (n,) of `triangles`."""
-        found = bilinear(self.pixels, np.einsum("nc,ncx->nx", barycentric, self.uv[rows]))
+        found = bilinear(self.pixels, np.einsum("nc,ncx->nx", barycentric, self.uv[rows]), self.extension)
         return np.clip(found[:, self.channels] * self.gain + self.offset, 0, 1)
 
     def lookups(self) -> NDArray[np.float64]:

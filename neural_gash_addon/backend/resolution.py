@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import methods
+from . import spherical_harmonics as sh
 from .errors import UserError
 from .geometry import Surface, TriangleMesh
 from .progress import scaled
@@ -28,6 +29,7 @@ MAX_FIT = 4096                    # the largest texture that an error asks for
 _POINTS = 4096                    # of the surface that are looked at
 _RAYS = 256                       # from each and from its texels, for each of two traces
 _LEAST_RATE, _MOST_RATE = 0.5, 2.0  # powers of the size by which an error falls: at a shadow's edge, where smooth
+_DARK = 1e-3                      # of the transfer in the open: less than this on the whole is not seen
 _STEP = 16                        # texels to which sizes are rounded up
 
 Trial = Callable[[NDArray], Generator[float, None, int]]
@@ -57,7 +59,8 @@ def fitting_side(surface: Surface, uv: NDArray, *, error: float, method: str = "
     trace = partial(_traced, method=method, order=order, scene=scene, seed=seed, threads=threads)
     yield 0.0
     exact = trace(points, first=0)
-    energy = float((exact[0] * exact[1]).sum())
+    dark = _DARK ** 2 * float(np.square(sh.cosine_lobe(points.normals, order)).sum())
+    energy = max(float((exact[0] * exact[1]).sum()), dark)
     errors: list[float] = []
     for number, side in enumerate(TRIALS):
         yield (number + 1) / (len(TRIALS) + 1)

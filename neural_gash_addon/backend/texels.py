@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from .geometry import INSET, TEXEL, Surface, TriangleMesh, unit
 from .raster import Coverage
 
+REPEAT, EXTEND, CLIP, MIRROR = "REPEAT", "EXTEND", "CLIP", "MIRROR"  # what an image shows beyond 0 to 1
 _FARTHEST = 1e9      # UVs beyond have no digits left for a place in an image
 _AT_ONCE = 1 << 17  # texels computed at a time, so that memory stays small
 
@@ -22,8 +23,9 @@ class NormalMap:
     image: NDArray[np.float32]      # (H, W, 3) as stored, 0 to 1; row 0 at the bottom
     strength: float                 # 1: as the image says
     triangles: NDArray[np.bool_]    # (F,) those that are shaded with it
-    uv: NDArray[np.float32]         # (C, 2) of each face corner, in the image
+    uv: NDArray[np.float64]         # (C, 2) of each face corner, in the image
     tangents: NDArray[np.float32]   # (C, 4) MikkTSpace tangents in the bake frame, and the bitangent's sign
+    extension: str = REPEAT         # see `bilinear`
 
 
 def texel_points(surface: Surface, coverage: Coverage, normal_maps: Sequence[NormalMap] = ()) -> TriangleMesh:
@@ -67,7 +69,7 @@ def _mapped(normal_map: NormalMap, corners: NDArray, weights: NDArray, smooth: N
     tangents = normal_map.tangents[corners].astype(np.float64)                  # (n, 3, 4)
     tangent = np.einsum("nc,ncx->nx", weights, tangents[..., :3])
     sign = np.einsum("nc,nc->n", weights, tangents[..., 3])
-    colour = 2 * bilinear(normal_map.image, uv) - 1
+    colour = 2 * bilinear(normal_map.image, uv, normal_map.extension) - 1
     strength = max(normal_map.strength, 0.0)
     colour[:, :2] *= strength
     colour[:, 2] = 1 + (colour[:, 2] - 1) * min(strength, 1.0)
@@ -76,10 +78,22 @@ def _mapped(normal_map: NormalMap, corners: NDArray, weights: NDArray, smooth: N
     return np.where(np.any(mapped != 0, axis=1, keepdims=True), mapped, smooth)
 
 
-def bilinear(image: NDArray, uv: NDArray) -> NDArray[np.float64]:
-    """Colours (n, 3) of an image (H, W, 3) that repeats, at uv (n, 2); at 0 where that is no number."""
-    height, width = image.shape[:2]
+def bilinear(image: NDArray, uv: NDArray, extension: str = REPEAT) -> NDArray[np.float64]:
+    """Colours (n, 3) of an image (H, W, 3) at uv (n, 2); at 0 where that is no number.
+
+    Args:
+        extension: what is beyond 0 to 1, as Blender calls it: 'REPEAT', 'EXTEND' (what is at the edge), 'CLIP'
+            (black), 'MIRROR' (it repeats, every other time mirrored).
+    """
     uv = np.where(np.abs(uv) < _FARTHEST, uv, 0)
+    size = np.array(image.shape[1::-1])
+    if extension == CLIP:
+        image, uv, size = np.pad(image, ((1, 1), (1, 1), (0, 0))), (uv * size + 1) / (size + 2), size + 2
+    width, height = size.tolist()
+    if extension == MIRROR:
+        uv = 1 - np.abs(uv % 2 - 1)
+    if extension != REPEAT:
+        uv = np.clip(uv, 0.5 / size, 1 - 0.5 / size)
     x, y = uv[:, 0] * width - 0.5, uv[:, 1] * height - 0.5
     column, row = np.floor(x), np.floor(y)
     s, t = (x - column)[:, None], (y - row)[:, None]

@@ -30,6 +30,7 @@ from . import state
 from .bake import Baking
 
 _TURNED = 1e-3  # of the turn since the bake: what cannot be seen
+_MOST_HALF = 2e4  # of a bright light's; three times as much, as beside a chart, still fits 16 bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,8 +104,8 @@ class NEURAL_GASH_OT_bake_gloss(Baking, bpy.types.Operator):
         if read_record(obj) != job.record or not staleness.same(obj, job.record):
             raise UserError(f"'{obj.name}' or what shadows it was changed during the bake; bake again.")
         images = bake_images(obj.data, job.record)
-        made = make_images(obj.name, transfer, folder_of(images), images[0].use_half_precision, label="prt_gloss",
-                           owners=[obj.data])
+        half = images[0].use_half_precision and all(np.abs(c).max() < _MOST_HALF for c in transfer.coefficients)
+        made = make_images(obj.name, transfer, folder_of(images), half, label="prt_gloss", owners=[obj.data])
         write_bounces(obj.data, made, transfer.record, job.light, job.finish, job.lobe)
         context.scene.neural_gash.gloss = True
         if not is_glossy(obj):

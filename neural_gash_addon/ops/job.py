@@ -160,7 +160,8 @@ def _key(settings: NeuralGashSettings, shape: str, matrix: NDArray, maps: Sequen
     """What tells a texture bake from any other, in one text."""
     digest = hashlib.blake2b(np.round(matrix, 6).tobytes(), digest_size=16)
     for normal_map in maps:
-        digest.update(normal_map.image.tobytes() + normal_map.uv.tobytes() + str(normal_map.strength).encode())
+        digest.update(normal_map.image.tobytes() + normal_map.uv.tobytes()
+                      + f"{normal_map.strength} {normal_map.extension}".encode())
     chosen = {name: getattr(settings, name) for name in
               ("method", "order", "quality", "rays", "tolerance", "sizing", "side", "texels_per_metre", "padding",
                "bounces", "share")}

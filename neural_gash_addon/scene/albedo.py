@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..backend.errors import UserError
@@ -13,12 +14,13 @@ from ..backend.pictures import Picture
 from .gloss_nodes import SPECULAR
 from .nodes import DEFAULT_ALBEDO
 from .preview import COLOUR_SOCKETS, DEFAULT_ROUGHNESS, shader_node, shown_material
-from .world import linear_pixels
+from .uv_maps import own_uv_name
+from .world import feeding, linear_pixels
 
 Finish = tuple[NDArray[np.float64], list[Picture]]  # (F, 7) of triangles, and images that say it from place to place
+Images = dict[int, NDArray[np.float32]]  # session uid of an image -> (H, W, 3) scene-linear
 
-
-def triangle_finish(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArray[np.int32]) -> Finish:
+def triangle_finish(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArray[np.int32], known: Images) -> Finish:
     """Of the triangles with these face corners (F, 3): albedo, specular colour (linear) and roughness (F, 7).
 
     A plain colour or an image by UV counts; where other nodes make the colour, the socket's own value
@@ -26,6 +28,7 @@ def triangle_finish(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArra
 
     Args:
         obj: evaluated, or not. mesh: its geometry, whose loop triangles have been computed.
+        known: images that have been read, to which others are added: many objects may share a large one.
     Returns:
         The means over each triangle, and the images.
     """
@@ -39,7 +42,7 @@ def triangle_finish(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArra
     for number, material in enumerate(materials or [None]):
         here = np.flatnonzero(slot_of == number)
         if len(here):
-            out[here], found = _finish(material, mesh, corners[here])
+            out[here], found = _finish(material, mesh, corners[here], known)
             pictures += [replace(picture, triangles=here) for picture in found]
     out = np.clip(np.nan_to_num(out), 0, 1)
     for picture in pictures:
@@ -47,7 +50,7 @@ def triangle_finish(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArra
     return out, pictures
 
 
-def _finish(material: bpy.types.Material | None, mesh: bpy.types.Mesh, corners: NDArray) -> Finish:
+def _finish(material: bpy.types.Material | None, mesh: bpy.types.Mesh, corners: NDArray, known: Images) -> Finish:
     """(7,) of one material, and the images that say it better, of these triangles (f, 3)."""
     node = shader_node(material)
     out, pictures = np.empty(7), []
@@ -58,12 +61,12 @@ def _finish(material: bpy.types.Material | None, mesh: bpy.types.Mesh, corners: 
         socket = node.inputs[COLOUR_SOCKETS[node.type]]
         out[:3] = _value(socket)
         if "Metallic" in node.inputs and not node.inputs["Metallic"].is_linked:
-            metallic = node.inputs["Metallic"].default_value
-        pictures = _pictures(socket, mesh, corners, np.arange(6), np.arange(6) % 3,
+            metallic = float(np.clip(np.nan_to_num(node.inputs["Metallic"].default_value), 0, 1))
+        pictures = _pictures(socket, mesh, corners, known, np.arange(6), np.arange(6) % 3,
                              np.repeat([1 - metallic, metallic], 3), np.repeat([0.0, SPECULAR * (1 - metallic)], 3))
         if "Roughness" in node.inputs:
             out[6] = _value(node.inputs["Roughness"])[0]
-            pictures += _pictures(node.inputs["Roughness"], mesh, corners, *np.array([[6], [0], [1], [0]]))
+            pictures += _pictures(node.inputs["Roughness"], mesh, corners, known, *np.array([[6], [0], [1], [0]]))
     out[3:6] = SPECULAR + metallic * (out[:3] - SPECULAR)
     out[:3] *= 1 - metallic
     return out, pictures
@@ -71,37 +74,71 @@ def _finish(material: bpy.types.Material | None, mesh: bpy.types.Mesh, corners: 
 
 def _value(socket: bpy.types.NodeSocket) -> NDArray[np.float64]:
     """(3,) of an input, a colour or a number."""
-    source = socket.links[0].from_node if socket.is_linked else None
-    if source is not None and source.type == "RGB":
-        return np.array(source.outputs[0].default_value[:3])
+    output = feeding(socket)
+    if output is not None and output.node.type == "RGB":
+        return np.array(output.default_value[:3])
     return np.resize(np.array(socket.default_value, float), 4)[:3]
 
 
-def _pictures(socket: bpy.types.NodeSocket, mesh: bpy.types.Mesh, corners: NDArray, columns: NDArray,
-              channels: NDArray, gain: NDArray, offset: NDArray) -> list[Picture]:
+def _pictures(socket: bpy.types.NodeSocket, mesh: bpy.types.Mesh, corners: NDArray, known: Images,
+              columns: NDArray, channels: NDArray, gain: NDArray, offset: NDArray) -> list[Picture]:
     """The image that an input takes its value from by UV, if it does."""
-    source = socket.links[0].from_node if socket.is_linked else None
+    output = feeding(socket)
+    source = output.node if output is not None and output.name == "Color" else None
     if source is None or source.type != "TEX_IMAGE" or source.image is None:
         return []
-    layer = _uv_layer(source, mesh)
-    if layer is None:
+    uv = image_uv(source, mesh)
+    if uv is None:
         return []
+    uid = source.image.session_uid
     try:
-        pixels = np.nan_to_num(linear_pixels(source.image)[..., :3])
+        if uid not in known:
+            known[uid] = np.nan_to_num(linear_pixels(source.image)[..., :3])
     except UserError:
-        return []  # pink on screen, too
+        return []  # pink on screen, or not one image
+    return [Picture(np.arange(len(corners)), uv[corners], known[uid], columns, channels, gain, offset,
+                    source.extension)]
+
+
+def image_uv(texture: bpy.types.Node, mesh: bpy.types.Mesh) -> NDArray[np.float64] | None:
+    """(C, 2) at which each face corner has an Image Texture node looked up; None where no UV map says it."""
+    if texture.projection != "FLAT":
+        return None
+    output = feeding(texture.inputs["Vector"])
+    placing: NDArray | None = np.eye(4)
+    if output is not None and output.node.type == "MAPPING":
+        placing = _placing(output.node)
+        output = feeding(output.node.inputs["Vector"])
+        if output is None:
+            return None
+    layer = _uv_layer(output, mesh)
+    if layer is None or placing is None:
+        return None
     uv = np.empty((len(layer.uv), 2), np.float32)
     layer.uv.foreach_get("vector", uv.ravel())
-    return [Picture(np.arange(len(corners)), uv[corners].astype(np.float64), pixels, columns, channels, gain, offset)]
+    found: NDArray[np.float64] = np.where(np.isfinite(uv), uv, 0) @ placing[:2, :2].T + placing[:2, 3]
+    return found
 
 
-def _uv_layer(texture: bpy.types.Node, mesh: bpy.types.Mesh) -> bpy.types.MeshUVLoopLayer | None:
-    """The UV map that an Image Texture node reads; None where its mapping is made otherwise."""
-    if texture.inputs["Vector"].is_linked:
-        node = texture.inputs["Vector"].links[0].from_node
-        if node.type == "UVMAP" and node.uv_map:
-            return mesh.uv_layers.get(node.uv_map)
-        if node.type != "UVMAP" and not (node.type == "TEX_COORD"
-                                         and texture.inputs["Vector"].links[0].from_socket.name == "UV"):
+def _placing(mapping: bpy.types.Node) -> NDArray[np.float64] | None:
+    """(4, 4) of a Mapping node; None where it is none that numbers make."""
+    if mapping.vector_type not in ("POINT", "TEXTURE") or any(socket.is_linked for socket in mapping.inputs[1:]):
+        return None
+    location, rotation, scale = (mapping.inputs[name] for name in ("Location", "Rotation", "Scale"))
+    matrix = np.array(Matrix.LocRotScale(location.default_value, rotation.default_value, scale.default_value))
+    if not np.isfinite(matrix).all():
+        return None
+    if mapping.vector_type == "POINT":
+        return matrix
+    return np.linalg.inv(matrix) if np.linalg.det(matrix) else None
+
+
+def _uv_layer(output: bpy.types.NodeSocket | None, mesh: bpy.types.Mesh) -> bpy.types.MeshUVLoopLayer | None:
+    """The UV map that an output gives, or that serves where none is linked; None where it gives something else."""
+    if output is not None:
+        if output.node.type == "UVMAP" and output.node.uv_map:
+            return mesh.uv_layers.get(output.node.uv_map)
+        if output.node.type != "UVMAP" and not (output.node.type == "TEX_COORD" and output.name == "UV"):
             return None
-    return next((layer for layer in mesh.uv_layers if layer.active_render), None)
+    own = own_uv_name(mesh)  # the rendered one only where the person has none: was not there when it was baked
+    return next((layer for layer in mesh.uv_layers if layer.active_render and layer.name != own), None)

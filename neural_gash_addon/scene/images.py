@@ -137,19 +137,22 @@ def _write(stem: str, transfer: TextureTransfer, folder: Path, half: bool, parts
     except OSError as error:
         raise UserError(f"The folder '{folder}' cannot be made ({reason(error)}).") from error
     check_writable(paths[0])
-    for path in paths:
-        if path.exists():
-            try:
+    record_file = folder / f"{stem}.json"
+    for path in filter(Path.exists, [*paths, record_file]):
+        try:
+            if path == record_file:
+                BakeRecord.from_json(path.read_text())
+            else:
                 exr.read_record(path)
-            except UserError as error:
-                raise UserError(f"There is a file '{path}' that no bake made; choose another folder.") from error
+        except (OSError, ValueError, UserError) as error:
+            raise UserError(f"There is a file '{path}' that no bake made; choose another folder.") from error
     side, filled, text = transfer.record.side, transfer.fill_map(), transfer.record.to_json()
     try:
         with ExitStack() as drafts:  # which take their places together, once all are whole
             for number, path in enumerate(paths):
                 image = transfer.image(number, filled).reshape(side, side, 4)
                 exr.write(drafts.enter_context(atomic(path)), image, text, half)
-            beside = drafts.enter_context(atomic(folder / f"{stem}.json"))
+            beside = drafts.enter_context(atomic(record_file))
             beside.write_text((f'{text[:-1]}, "objects": {parts}}}' if parts else text) + "\n")
     except OSError as error:
         raise UserError(f"The textures cannot be written to '{folder}' ({reason(error)}).") from error

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from ..backend.errors import UserError
 from ..backend.geometry import Surface
 from ..backend.texels import NormalMap
+from .albedo import image_uv
 from .evaluation import evaluated
 from .frames import Array
-from .preview import shader_node
-from .uv_maps import read_uv
-from .world import linear_pixels
+from .preview import shader_node, shown_material
+from .uv_maps import own_uv_name
+from .world import feeding, linear_pixels
 
 _STEEPEST = 1e3  # of what a normal map says: far beyond 0 to 1
 
@@ -27,8 +28,9 @@ def read_normal_maps(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, surf
     Raises:
         UserError: a normal map's image or UV map cannot be read.
     """
-    found = [(slot, node) for slot, item in enumerate(obj.material_slots)
-             if (node := _normal_node(item.material)) is not None]
+    materials = [shown_material(slot.material) for slot in obj.material_slots]
+    found = [(slot, material, *nodes) for slot, material in enumerate(materials)
+             if material is not None and (nodes := _normal_nodes(material)) is not None]
     if not found:
         return []
     slots = np.zeros(int(surface.corner_faces.max()) + 1, np.int32)
@@ -37,49 +39,52 @@ def read_normal_maps(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, surf
         mesh = copy.to_mesh()
         try:
             mesh.polygons.foreach_get("material_index", slots)
-            slots = np.clip(slots, 0, len(obj.material_slots) - 1)
-            for slot, node in found:
+            slots = np.clip(slots, 0, len(materials) - 1)
+            for slot, material, node, texture in found:
                 name = node.uv_map or _rendered_uv(obj.data)
                 if name not in obj.data.uv_layers:
                     wanted = f"reads the UV map '{name}'" if name else "needs a UV map"
-                    raise UserError(f"The normal map of the material '{obj.material_slots[slot].material.name}' "
+                    raise UserError(f"The normal map of the material '{material.name}' "
                                     f"{wanted}, which '{obj.name}' does not have.")
-                uv = read_uv(obj.data, name)
-                maps.append(NormalMap(_pixels(obj.material_slots[slot].material, node),
-                                      float(node.inputs["Strength"].default_value),
-                                      slots[surface.polygons] == slot, uv, _tangents(obj.name, mesh, name, matrix)))
+                pixels, uv = _pixels(material, texture), image_uv(texture, mesh)
+                if uv is None:
+                    continue  # it is not looked up by UV
+                maps.append(NormalMap(pixels, float(node.inputs["Strength"].default_value),
+                                      slots[surface.polygons] == slot, uv, _tangents(obj.name, mesh, name, matrix),
+                                      texture.extension))
         finally:
             copy.to_mesh_clear()
     return maps
 
 
-def _normal_node(material: bpy.types.Material | None) -> bpy.types.Node | None:
-    """The Normal Map node that feeds the shader of a material, if it is one that reads an image by UV."""
+def _normal_nodes(material: bpy.types.Material) -> tuple[bpy.types.Node, bpy.types.Node] | None:
+    """The Normal Map node that feeds the shader of a material and its Image Texture node; None where it has none."""
     shader = shader_node(material)
-    if shader is None or not shader.inputs["Normal"].is_linked:
+    normal = feeding(shader.inputs["Normal"]) if shader is not None else None
+    if normal is None or normal.node.type != "NORMAL_MAP":
         return None
-    node = shader.inputs["Normal"].links[0].from_node
-    usable = (node.type == "NORMAL_MAP" and node.space == "TANGENT" and not node.mute
-              and not node.inputs["Strength"].is_linked and node.inputs["Color"].is_linked
-              and node.inputs["Color"].links[0].from_node.type == "TEX_IMAGE")
-    return node if usable else None
+    node = normal.node
+    colour = feeding(node.inputs["Color"])
+    if node.space != "TANGENT" or node.inputs["Strength"].is_linked or colour is None:
+        return None
+    return (node, colour.node) if colour.node.type == "TEX_IMAGE" and colour.name == "Color" else None
 
 
-def _pixels(material: bpy.types.Material, node: bpy.types.Node) -> NDArray[np.float32]:
-    """(H, W, 3) of the node's image."""
-    image = node.inputs["Color"].links[0].from_node.image
-    if image is None:
+def _pixels(material: bpy.types.Material, texture: bpy.types.Node) -> NDArray[np.float32]:
+    """(H, W, 3) of an Image Texture node."""
+    if texture.image is None:
         raise UserError(f"The normal map of the material '{material.name}' has no image.")
     try:
-        pixels = np.nan_to_num(linear_pixels(image)[..., :3], nan=0.5)  # a half in all channels bends nothing
+        pixels = np.nan_to_num(linear_pixels(texture.image)[..., :3], nan=0.5)  # a half in all channels bends nothing
     except UserError as error:
         raise UserError(f"The normal map of the material '{material.name}' cannot be read: {error}") from error
     return np.ascontiguousarray(np.clip(pixels, -_STEEPEST, _STEEPEST))
 
 
 def _rendered_uv(data: bpy.types.Mesh) -> str:
-    """Name of the UV map that renders use where none is named; '' where there is none."""
-    return next((layer.name for layer in data.uv_layers if layer.active_render), "")
+    """Name of the UV map of the person's that renders use where none is named; '' where there is none."""
+    return next((layer.name for layer in data.uv_layers
+                 if layer.active_render and layer.name != own_uv_name(data)), "")
 
 
 def _tangents(name: str, mesh: bpy.types.Mesh, uv_map: str, matrix: Array) -> NDArray[np.float32]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..backend.errors import UserError
 from ..backend.geometry import Surface, TriangleMesh, unit
-from .albedo import Finish, triangle_finish
+from .albedo import Finish, Images, triangle_finish
 from .attributes import RECORD, discard
 from .evaluation import evaluated, revealed, shown_objects
 from .frames import Array, as_array, bake_frame, rotation_part
@@ -180,15 +180,16 @@ def read_occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgr
 
 def read_finish(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph) -> Finish:
     """`triangle_finish` of the triangles of `obj`, then of those of `read_occluders`, in its order."""
+    known: Images = {}
     with evaluated(obj, depsgraph) as copy:
         mesh = copy.to_mesh()
         try:
-            own = triangle_finish(obj, mesh, _triangle_corners(mesh))
+            own = triangle_finish(copy, mesh, _triangle_corners(mesh), known)
         finally:
             copy.to_mesh_clear()
     values: list[Array] = []
     pictures = []
-    others = ((finish, matrix) for _, _, finish, matrix in _occluders(obj, mode, depsgraph, coloured=True))
+    others = ((finish, matrix) for _, _, finish, matrix in _occluders(obj, mode, depsgraph, known))
     for (found, images), matrix in [(own, as_array(obj.matrix_world)), *others]:
         start = sum(map(len, values))
         pictures += [replace(image, triangles=start + image.triangles, uv=_outward(image.uv, matrix))
@@ -269,27 +270,28 @@ def same_fingerprint(first: str, second: str) -> bool:
     return a.shape == b.shape and bool(np.allclose(a, b, rtol=2 * _SAME, atol=2 * _SAME))
 
 
-def _occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph, coloured: bool = False,
+def _occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph, images: Images | None = None,
                ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int32], Finish, Array]]:
     """(local positions, triangles, finish, world matrix) of each object and instance that blocks, but `obj`.
 
-    The finish is empty unless `coloured`: images take time to read.
+    The finish is empty unless `images`, which `triangle_finish` wants, are given: they take time to read.
     """
     if mode == SELF:
         return
     if mode == VISIBLE:
-        yield from _instances(depsgraph, None, obj, coloured)
+        yield from _instances(depsgraph, None, obj, images)
         return
     members = _members(mode)
     hidden = [o for o in members if o != obj and not o.visible_get(view_layer=depsgraph.view_layer)]
     owners = {o.session_uid for o in members} - {o.session_uid for o in hidden}
-    yield from _instances(depsgraph, owners, obj, coloured)
+    yield from _instances(depsgraph, owners, obj, images)
     if hidden:
         with revealed(hidden, depsgraph) as (own_depsgraph, _):
-            yield from _instances(own_depsgraph, None, None, coloured)
+            yield from _instances(own_depsgraph, None, None, images)
 
 
-def _instances(depsgraph: bpy.types.Depsgraph, owners: set[int] | None, baked: bpy.types.Object | None, coloured: bool,
+def _instances(depsgraph: bpy.types.Depsgraph, owners: set[int] | None, baked: bpy.types.Object | None,
+               images: Images | None,
                ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int32], Finish, Array]]:
     """The solid objects and instances of a depsgraph; of the objects in `owners` only, where given.
 
@@ -310,14 +312,14 @@ def _instances(depsgraph: bpy.types.Depsgraph, owners: set[int] | None, baked: b
             continue
         key = (solid.data.as_pointer(), solid.original.session_uid)
         if key not in known:
-            known[key] = _solid_arrays(solid, coloured)
+            known[key] = _solid_arrays(solid, images)
         arrays = known[key]
         matrix = as_array(instance.matrix_world)
         if arrays is not None and np.isfinite(matrix).all():
             yield *arrays, matrix
 
 
-def _solid_arrays(solid: bpy.types.Object, coloured: bool
+def _solid_arrays(solid: bpy.types.Object, images: Images | None
                   ) -> tuple[NDArray[np.float32], NDArray[np.int32], Finish] | None:
     """Local positions, triangles and their finish of an evaluated object; None where it has no faces."""
     try:
@@ -333,7 +335,8 @@ def _solid_arrays(solid: bpy.types.Object, coloured: bool
         corners = _triangle_corners(mesh)
         triangles = _corner_vertices(mesh)[corners]
         whole = np.isfinite(positions).all(axis=1)[triangles].all(axis=1)
-        finish, pictures = triangle_finish(solid, mesh, corners) if coloured else (np.zeros((len(whole), 7)), [])
+        finish, pictures = ((np.zeros((len(whole), 7)), []) if images is None
+                            else triangle_finish(solid, mesh, corners, images))
         return (np.nan_to_num(positions), triangles[whole],
                 (finish[whole], [picture.only(whole) for picture in pictures]))
     finally:

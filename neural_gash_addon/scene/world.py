@@ -83,7 +83,13 @@ def _background(world: bpy.types.World | None, order: int) -> Array:
 
 
 def _source(socket: bpy.types.NodeSocket) -> bpy.types.Node | None:
-    """The node that feeds an input, through reroutes and muted nodes' passes; None where nothing does."""
+    """The node of `feeding`."""
+    output = feeding(socket)
+    return output.node if output else None
+
+
+def feeding(socket: bpy.types.NodeSocket) -> bpy.types.NodeSocket | None:
+    """The output that feeds an input, through reroutes and muted nodes' passes; None where nothing does."""
     while socket.is_linked:
         link = socket.links[0]
         node = link.from_node
@@ -97,7 +103,7 @@ def _source(socket: bpy.types.NodeSocket) -> bpy.types.Node | None:
                 return None
             socket = passes[0]
         else:
-            return node
+            return link.from_socket
     return None
 
 
@@ -149,11 +155,11 @@ def linear_pixels(image: bpy.types.Image) -> NDArray[np.float32]:
         raise UserError(f"The image '{image.name}' cannot be loaded from '{bpy.path.abspath(image.filepath)}'.")
     pixels = np.empty((height, width, image.channels), np.float32)
     image.pixels.foreach_get(pixels.ravel())
-    if image.channels == 4 and not image.is_float and image.alpha_mode == "STRAIGHT":
+    space = image.colorspace_settings
+    if image.channels == 4 and not image.is_float and image.alpha_mode == "STRAIGHT" and not space.is_data:
         pixels[..., :3] *= pixels[..., 3:]  # before decoding, as Cycles does
     if image.channels < 3:  # grey, with or without alpha
         pixels = np.repeat(pixels[..., :1], 3, axis=2)
-    space = image.colorspace_settings
     if image.is_float or space.is_data or space.name in ("Linear", "Linear Rec.709"):
         return pixels  # float images come in scene-linear, whatever they were stored in
     if space.name != "sRGB":

@@ -306,6 +306,23 @@ def test_uv_map_without_area_is_refused():
         methods.run(texture.bake(mesh, uv=np.full((len(mesh.corner_vertices), 2), 0.5), side=32, rays=4))
 
 
+@pytest.mark.parametrize("lost", ["at the origin", "in the middle", "on a line", "one face"])
+def test_faces_without_area_in_the_uv_map_are_named(lost):
+    """They would show what texels of others do, or one texel."""
+    floor = np.array([[-2., -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]])
+    mesh = surface((np.concatenate([floor, floor + [0, 0, 1]]), np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])))
+    uv = (mesh.positions[mesh.corner_vertices][:, :2] + 2) / 4
+    if lost == "one face":
+        uv[6:9] = 0.5
+    elif lost == "on a line":
+        uv[:, 1] = 0.3
+    else:
+        uv[:] = 0 if lost == "at the origin" else 0.5
+    first = 2 if lost == "one face" else 0
+    with pytest.raises(UserError, match=rf"^{1 if first else 4} of the faces have no area .* is {first}\)"):
+        methods.run(texture.bake(mesh, uv=uv, side=32, rays=4))
+
+
 def test_own_atlas_equals_the_one_made_before():
     mesh = surface(shapes.torus())
     both = [methods.run(texture.bake(mesh, uv=uv, side=64, order=2, rays=16)) for uv in (None, atlas(mesh, 64).uv)]

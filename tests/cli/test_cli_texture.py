@@ -40,6 +40,7 @@ def test_options_that_do_not_fit_are_refused(refused, blend, tmp_path):
     assert "texels per metre" in refused("bake", blend, "--object", "Ring", "--texture", "0/m", "--out", out)
     assert "resolution" in refused("bake", blend, "--object", "Ring", "--texture", 5, "--out", out)
     assert "no UV map" in refused("bake", blend, "--object", "Ring", "--texture", 64, "--uv-map", "X", "--out", out)
+    assert "--uv-map" in refused("bake", blend, "--object", "Ring", "--texture", "9/m", "--uv-map", "X", "--out", out)
     assert not list(tmp_path.iterdir())
 
 

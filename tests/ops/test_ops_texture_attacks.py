@@ -2,6 +2,7 @@
 """What a person may do to texture bakes: names that clash, UV maps that go, numbers that are none."""
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
@@ -318,3 +319,73 @@ def test_flipped_uvs_give_the_same_bake_flipped(make, texture):
         found.append(pixels[:, ::flip])
     assert np.abs(found[0]).max() > 0.2
     np.testing.assert_allclose(found[0], found[1], atol=0.01)
+
+
+def test_a_normal_map_counts_again_while_the_preview_is_on(make, texture):
+    obj = make(*FLOOR)
+    obj.data.uv_layers.new(name="Mine")
+    _normal_map(obj, 0.8, "Mine")
+    _bake(obj)
+    before = _pixels(_images(obj)[0])
+    _bake(obj)  # the preview's material is in the slot now
+    np.testing.assert_array_equal(_pixels(_images(obj)[0]), before)
+    assert np.abs(before[16, 16, [1, 3]]).min() > 0.1  # bent: a flat floor's are zero
+
+
+def test_a_fitted_texture_is_small_where_next_to_no_light_comes(make, texture):
+    """Some rays slip through where the box's faces meet; they are no shadows that ask for texels."""
+    make(name="Box").scale = (4, 4, 4)
+    floor = make(*FLOOR)
+    texture.sizing, texture.tolerance, texture.occluders, texture.rays = "FIT", 0.02, "VISIBLE", 64
+    _bake(floor)  # to 4096 texels a side, once, in two minutes
+    assert json.loads(floor.data["neural_gash"])["side"] <= 64
+
+
+def test_a_record_file_that_no_bake_made_is_kept(make, texture, tmp_path, refused, snapshot):
+    texture.texture_folder = str(tmp_path)
+    make(*FLOOR, name="Floor")
+    before = snapshot()
+    (tmp_path / "Floor_prt.json").write_text('{"mine": 1}')
+    assert "Floor_prt.json' that no bake made" in refused(bpy.ops.neural_gash.bake)
+    assert snapshot() == before and [p.name for p in tmp_path.iterdir()] == ["Floor_prt.json"]
+    assert (tmp_path / "Floor_prt.json").read_text() == '{"mine": 1}'
+
+
+@pytest.mark.parametrize("by", ["its UV map", "a mapping"])
+def test_a_normal_map_is_looked_up_where_its_image_lies(make, texture, by):
+    """Whose left half is flat: the Normal Map node's own UV map is that of the tangents only."""
+    obj = make(*FLOOR)
+    square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
+    for name, uv in (("Whole", square), ("Left", 0.3 * square + 0.1)):
+        obj.data.uv_layers.new(name=name).uv.foreach_set("vector", uv.ravel())
+    _normal_map(obj, 0.5, "Whole")
+    tree = obj.data.materials[0].node_tree
+    node = next(n for n in tree.nodes if n.type == "TEX_IMAGE")
+    pixels = np.tile(np.array([0.5, 0.5, 1, 1], np.float32), (4, 4, 1))
+    pixels[:, 2:, 0] = 0.9
+    node.image.pixels.foreach_set(pixels.ravel())
+    _bake(obj)
+    assert np.abs(_pixels(_images(obj)[0])[..., 3]).max() > 0.1  # the right half is bent
+    if by == "a mapping":
+        place, mapping = tree.nodes.new("ShaderNodeTexCoord"), tree.nodes.new("ShaderNodeMapping")
+        mapping.inputs["Location"].default_value, mapping.inputs["Scale"].default_value = (0.1,) * 3, (0.3,) * 3
+        tree.links.new(place.outputs["UV"], mapping.inputs["Vector"])
+        tree.links.new(mapping.outputs["Vector"], node.inputs["Vector"])
+    else:
+        other = tree.nodes.new("ShaderNodeUVMap")
+        other.uv_map = "Left"
+        tree.links.new(other.outputs["UV"], node.inputs["Vector"])
+    _bake(obj)
+    assert np.abs(_pixels(_images(obj)[0])[16, 8:24, 3]).max() < 1e-5
+
+
+def test_glossy_bounces_of_a_bright_light_are_numbers_in_16_bits_too(make, texture):
+    world = bpy.context.scene.world = bpy.data.worlds.new("Sky")
+    world.color = (1e6, 1e6, 1e6)
+    texture.half, texture.gloss = True, True
+    make([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (0, 1, 1)], [(0, 1, 2, 3), (0, 3, 5, 4)])
+    assert bpy.ops.neural_gash.bake() == bpy.ops.neural_gash.bake_gloss() == {"FINISHED"}
+    obj = bpy.context.object
+    bounced = [_pixels(image) for image in _images(obj, "neural_gash_gloss_images")]
+    assert all(np.isfinite(pixels).all() for pixels in bounced) and np.max(bounced) > 1e5
+    assert _images(obj)[0].use_half_precision

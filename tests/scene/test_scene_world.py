@@ -135,6 +135,23 @@ def test_byte_srgb_image_is_linearised(render, camera):
     np.testing.assert_allclose(light[0], math.sqrt(4 * math.pi) * shown, rtol=1e-4)
 
 
+@pytest.mark.parametrize("space", ["sRGB", "Non-Color"])
+def test_alpha_darkens_colours_but_not_numbers_as_in_cycles(render, camera, tmp_path, space):
+    """A normal map or a roughness may have something of its own in the alpha of its file."""
+    _, texture = _environment(np.ones((2, 4, 3)), is_float=False)
+    drawn = bpy.data.images.new("drawn", 4, 2, alpha=True)
+    drawn.pixels.foreach_set(np.tile(np.array([0.2, 0.4, 0.8, 0.25], np.float32), 8))
+    drawn.filepath_raw, drawn.file_format = str(tmp_path / "drawn.png"), "PNG"
+    drawn.save()
+    texture.image = bpy.data.images.load(drawn.filepath_raw)
+    texture.image.colorspace_settings.name = space
+    assert texture.image.alpha_mode == "STRAIGHT"
+    camera((0, 0, 0), (1, 0, 0), angle=0.1)
+    shown = render(4, 4)[0, 0, :3]
+    np.testing.assert_allclose(world_light(bpy.context.scene, 2)[0], math.sqrt(4 * math.pi) * shown,
+                               rtol=0.01, atol=0.005)  # eight bits
+
+
 def test_image_is_read_anew_when_it_changes():
     _, texture = _environment(np.ones((2, 4, 3)))
     before = world_light(bpy.context.scene, 2)
