@@ -20,6 +20,7 @@ from .world import feeding, linear_pixels
 Finish = tuple[NDArray[np.float64], list[Picture]]  # (F, 7) of triangles, and images that say it from place to place
 Images = dict[int, NDArray[np.float32]]  # session uid of an image -> (H, W, 3) scene-linear
 
+
 def triangle_finish(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArray[np.int32], known: Images) -> Finish:
     """Of the triangles with these face corners (F, 3): albedo, specular colour (linear) and roughness (F, 7).
 
