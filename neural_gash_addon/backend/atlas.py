@@ -40,14 +40,17 @@ class Placed:
 
 def check_part(part: Part) -> None:
     """UserError for a mesh that no texture has room for, whatever else is in it."""
-    places = part.surface.positions[part.surface.triangles]
-    areas = np.linalg.norm(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]), axis=1)
+    if part.uv is not None:
+        check_range(part.uv[part.surface.corners])
+    elif not _areas(part.surface).any():
+        raise UserError("All faces have an area of zero, so a texture has nothing to show; bake to vertices.")
+
+
+def check_area(part: Part) -> None:
+    """UserError where a person's UVs, which `check_part` let pass, give faces no area. An atlas may have to."""
     if part.uv is None:
-        if not areas.any():
-            raise UserError("All faces have an area of zero, so a texture has nothing to show; bake to vertices.")
         return
-    uv = np.asarray(part.uv, np.float64)[part.surface.corners]
-    check_range(uv)
+    areas, uv = _areas(part.surface), np.asarray(part.uv, np.float64)[part.surface.corners]
     (a, b), (c, d) = (uv[:, 1] - uv[:, 0]).T, (uv[:, 2] - uv[:, 0]).T
     room = np.abs(a * d - b * c)
     lost = room * areas.sum() <= _COLLAPSED * areas * room.sum()
@@ -55,6 +58,14 @@ def check_part(part: Part) -> None:
         faces = np.unique(part.surface.polygons[lost & (areas > 0)])
         raise UserError(f"{len(faces):,} of the faces have no area in the UV map (the first is {faces[0]}), so a "
                         "texture has no place for them; unwrap them, or let the bake make its own UV map.")
+
+
+def _areas(surface: Surface) -> NDArray[np.float64]:
+    """(F,) twice the area of each triangle."""
+    places = surface.positions[surface.triangles]
+    found: NDArray[np.float64] = np.linalg.norm(
+        np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]), axis=1)
+    return found
 
 
 def place(parts: Sequence[Part], *, side: int | None = None, texels_per_metre: float | None = None, padding: int = 2,

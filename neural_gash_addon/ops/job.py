@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend import methods
-from ..backend.atlas import Part, check_part
+from ..backend.atlas import Part, check_area, check_part
 from ..backend.bounce import Reflection
 from ..backend.errors import UserError
 from ..backend.exchange import check_folder
@@ -146,6 +146,7 @@ def _texture_options(obj: bpy.types.Object, settings: NeuralGashSettings, surfac
     trial = partial(fitting_side, surface, error=settings.tolerance, **what) if settings.sizing == FIT else None
     part = Part(surface, uv, trial, obj.name)
     check_part(part)  # here, as a texture that is shared is placed for all objects at once
+    check_area(part)
     return TextureOptions(part, uv is None, settings.uv_map, folder, settings.half, tiles)
 
 

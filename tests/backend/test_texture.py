@@ -7,6 +7,7 @@ import pytest
 
 from neural_gash_addon.backend import methods, metrics, packing, texture
 from neural_gash_addon.backend import spherical_harmonics as sh
+from neural_gash_addon.backend.atlas import Part, check_area
 from neural_gash_addon.backend.errors import UserError
 from neural_gash_addon.backend.geometry import Surface, TriangleMesh
 from neural_gash_addon.backend.raster import Layout
@@ -320,7 +321,7 @@ def test_faces_without_area_in_the_uv_map_are_named(lost):
         uv[:] = 0 if lost == "at the origin" else 0.5
     first = 2 if lost == "one face" else 0
     with pytest.raises(UserError, match=rf"^{1 if first else 4} of the faces have no area .* is {first}\)"):
-        methods.run(texture.bake(mesh, uv=uv, side=32, rays=4))
+        check_area(Part(mesh, uv))
 
 
 def test_own_atlas_equals_the_one_made_before():
