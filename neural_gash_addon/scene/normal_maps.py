@@ -17,6 +17,7 @@ from .uv_maps import own_uv_name
 from .world import feeding, linear_pixels
 
 _STEEPEST = 1e3  # of what a normal map says: far beyond 0 to 1
+_KEY_SIDE = 256  # of the pixels that tell one image from another
 
 
 def read_normal_maps(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, surface: Surface, matrix: Array
@@ -55,6 +56,24 @@ def read_normal_maps(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, surf
         finally:
             copy.to_mesh_clear()
     return maps
+
+
+def normal_map_key(obj: bpy.types.Object) -> bytes:
+    """What tells the normal maps of an object from others: their settings, and every so many of their pixels."""
+    parts = []
+    for slot, material in enumerate(shown_material(slot.material) for slot in obj.material_slots):
+        nodes = _normal_nodes(material) if material is not None else None
+        if nodes is None:
+            continue
+        node, texture = nodes
+        parts.append(repr((slot, round(node.inputs["Strength"].default_value, 4), node.uv_map)).encode())
+        try:
+            pixels = _pixels(material, texture)
+        except UserError:
+            continue  # a bake says so
+        step = -(-max(pixels.shape[:2]) // _KEY_SIDE)
+        parts.append(np.rint(pixels[::step, ::step] * 255).astype(np.int32).tobytes())
+    return b"".join(parts)
 
 
 def _normal_nodes(material: bpy.types.Material) -> tuple[bpy.types.Node, bpy.types.Node] | None:

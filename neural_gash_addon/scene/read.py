@@ -18,6 +18,7 @@ from .albedo import Finish, Images, triangle_finish
 from .attributes import RECORD, discard
 from .evaluation import evaluated, revealed, shown_objects
 from .frames import Array, as_array, bake_frame, rotation_part
+from .normal_maps import normal_map_key
 from .preview import preview_off
 from .uv_maps import mark_own_uv, own_uv_name
 
@@ -204,7 +205,7 @@ def fingerprint(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, occluder_
 
     Without other occluders it is the same wherever the object stands, however it is turned and
     uniformly scaled (none of which changes transfer). With them, what counts is where they stand
-    from the object. A texture's UVs (C, 2) count too,
+    from the object. A texture's UVs (C, 2) count too, and its normal maps;
     and with bounces the albedo of everything.
 
     Raises:
@@ -227,6 +228,7 @@ def fingerprint(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, occluder_
             _hash_shading(mesh, digest)
             if uv is not None:
                 digest.update(uv.tobytes())
+                digest.update(normal_map_key(obj))
         finally:
             copy.to_mesh_clear()
     linear = matrix[:3, :3]

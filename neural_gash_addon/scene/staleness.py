@@ -151,7 +151,8 @@ def _gloss_fits(obj: bpy.types.Object, record: BakeRecord) -> bool:
 def _reflects(obj: bpy.types.Object) -> bool:
     """Whether the bake depends on materials."""
     try:
-        return has_bake(obj) and (has_bounces(obj.data) or read_record(obj).colours == 3)
+        record = read_record(obj) if has_bake(obj) else None
+        return record is not None and (has_bounces(obj.data) or record.colours == 3 or bool(record.uv_map))
     except UserError:
         return False
 

@@ -389,3 +389,28 @@ def test_glossy_bounces_of_a_bright_light_are_numbers_in_16_bits_too(make, textu
     bounced = [_pixels(image) for image in _images(obj, "neural_gash_gloss_images")]
     assert all(np.isfinite(pixels).all() for pixels in bounced) and np.max(bounced) > 1e5
     assert _images(obj)[0].use_half_precision
+
+
+def test_a_changed_normal_map_makes_the_bake_stale(make, texture):
+    from neural_gash_addon.scene import staleness
+    obj = make(*FLOOR)
+    obj.data.uv_layers.new(name="Mine")
+    for loop in obj.data.loops:
+        obj.data.uv_layers["Mine"].uv[loop.index].vector = [
+            0.5 + 0.4 * c for c in obj.data.vertices[loop.vertex_index].co[:2]]
+    _normal_map(obj, 0.5)
+    _bake(obj)
+    assert staleness.check(obj)
+    tree = obj.data.materials[0].node_tree
+    strength = tree.nodes["Normal Map"].inputs["Strength"]
+    for change, back in ((lambda: setattr(strength, "default_value", 0.3),
+                          lambda: setattr(strength, "default_value", 1.0)),
+                         (lambda: bpy.data.images["bumps"].pixels.foreach_set(np.full(64, 0.25, np.float32)),
+                          lambda: bpy.data.images["bumps"].pixels.foreach_set(np.full(64, 0.5, np.float32)))):
+        change()
+        bpy.context.view_layer.update()
+        assert not staleness.check(obj)
+        back()
+        bpy.context.view_layer.update()
+        assert staleness.check(obj)
+    assert staleness._reflects(obj)   # so an edit of the material is looked at by itself
