@@ -384,3 +384,21 @@ def test_no_seam_at_the_mip_levels_that_the_padding_keeps_apart(padding, levels)
             found = np.concatenate([bilinear(im, places) for im in images], 1)[:, :9]
             error.append(metrics.rel_l2(found, sh.cosine_lobe(normals, 3)))
         assert error[0] <= 2 * error[1], (level, error)
+
+
+def test_a_lookup_whose_texels_other_charts_took_reads_the_nearest_one():
+    from neural_gash_addon.backend import resolution
+    from neural_gash_addon.backend.raster import Coverage
+    side, covered = 16, np.sort(np.random.default_rng(0).choice(256, 12, replace=False))
+    none = np.zeros((12, 3))
+    places = np.random.default_rng(1).uniform(0.05, 0.95, (200, 2))
+    rows, mix = resolution._around(Coverage(side, covered, np.zeros(12, np.int32), none, none), places)
+    np.testing.assert_allclose(mix.sum(1), 1)
+    x = places * side - 0.5
+    corners = np.floor(x)[:, None] + [(0, 0), (1, 0), (0, 1), (1, 1)]
+    lost = ~np.isin(corners[..., 1] * side + corners[..., 0], covered).any(1)
+    assert lost.sum() > 50
+    at = np.stack([covered % side, covered // side], 1)
+    away = np.linalg.norm(at[None] - np.rint(x)[lost, None], axis=2)
+    np.testing.assert_allclose(away[np.arange(lost.sum()), rows[lost, 0]], away.min(1))
+    assert (mix[lost, 0] == 1).all()
