@@ -18,7 +18,6 @@ import bpy
 import numpy as np
 
 from .backend import exchange, methods, shading
-from .backend import light as sh_light
 from .backend.errors import UserError
 from .backend.lobes import GGX, PHONG
 from .backend.transfer import Transfer
@@ -41,7 +40,7 @@ from .scene.gloss import can_gloss
 from .scene.preview import preview_on
 from .scene.read import make_applied_copy
 from .scene.render import render_preview, silent_blender
-from .scene.world import linear_pixels, rotated_light
+from .scene.world import file_light, rotated_light
 
 OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 _LOBES = [lobe.lower() for lobe in (GGX, PHONG)]
@@ -98,7 +97,8 @@ def _parser() -> argparse.ArgumentParser:
                                   epilog=parser.epilog)
     relight.add_argument("input", metavar="INPUT", help="baked .blend or .npz")
     relight.add_argument("--object", metavar="NAME", help="which object; needed where several are baked")
-    relight.add_argument("--hdri", metavar="FILE", type=Path, help="equirectangular image; else the file's World")
+    relight.add_argument("--hdri", metavar="FILE", type=Path,
+                         help="equirectangular image; else the light that the file has chosen")
     relight.add_argument("--rotation", type=float, default=0.0, metavar="DEG", help="about the vertical axis (0)")
     relight.add_argument("--strength", type=float, default=1.0, help="factor on the light (1)")
     relight.add_argument("--gloss", choices=_LOBES, help="show what materials mirror, with this lobe (of a texture)")
@@ -241,7 +241,7 @@ def _relight(arguments: argparse.Namespace) -> tuple[list[dict], str]:
         if arguments.hdri is None:
             raise UserError("A .npz has no World; give the light with --hdri.")
         arrays, record = exchange.load_npz(Path(arguments.input))
-        light = rotated_light(_hdri_light(arguments.hdri, record.order), *turn)
+        light = rotated_light(file_light(arguments.hdri, record.order), *turn)
         radiance = shading.radiance(arrays["transfer"], light).astype(np.float32)
         if arguments.npz:
             exchange.write_npz(arguments.npz.absolute(), positions=arrays["positions"], radiance=radiance, light=light)
@@ -258,7 +258,10 @@ def _relight(arguments: argparse.Namespace) -> tuple[list[dict], str]:
         if arguments.hdri is None:
             lighting.take_light(scene)
         else:
-            lighting.store_light(scene, _hdri_light(arguments.hdri, methods.sh.MAX_ORDER))
+            scene.neural_gash.hdri = str(arguments.hdri.absolute())
+            scene.neural_gash.light_source = lighting.HDRI
+            if lighting.problem(scene):
+                raise UserError(lighting.problem(scene))
         scene.neural_gash.light_rotation = turn[0]
         _set(scene.neural_gash, "light_strength", turn[1])
         preview_on(obj, arguments.gloss.upper() if arguments.gloss else "")
@@ -348,20 +351,6 @@ def _set(settings: NeuralGashSettings, name: str, value: float) -> None:
     if not kind.hard_min <= value <= kind.hard_max * (1 + 1e-6):  # the ends of float ranges are rounded
         raise UserError(f"The {kind.name.lower()} must be {kind.hard_min:g} to {kind.hard_max:g}, not {value:g}.")
     setattr(settings, name, value)
-
-
-def _hdri_light(path: Path, order: int) -> np.ndarray:
-    """(K, 3) of an image file."""
-    if not path.is_file():
-        raise UserError(f"There is no HDRI file '{path}'.")
-    try:
-        image = bpy.data.images.load(str(path.absolute()))
-    except RuntimeError as error:
-        raise UserError(f"The HDRI '{path}' cannot be read: {_reason(error)}.") from error
-    try:
-        return sh_light.project_equirect(linear_pixels(image), order)
-    finally:
-        bpy.data.images.remove(image)
 
 
 def _save(path: Path) -> None:

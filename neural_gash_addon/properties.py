@@ -5,7 +5,15 @@ from __future__ import annotations
 import math
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
+from bpy.props import (
+    BoolProperty,
+    EnumProperty,
+    FloatProperty,
+    FloatVectorProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
 
 from .backend.atlas import MAX_SIDE, MIN_SIDE
 from .backend.bounce import MAX_BOUNCES
@@ -13,7 +21,7 @@ from .backend.estimator import MAX_RAYS
 from .backend.lobes import GGX, PHONG
 from .backend.methods import METHODS, MIN_ORDER, MIN_TOLERANCE
 from .backend.spherical_harmonics import MAX_ORDER
-from .scene.lighting import apply_light, show_gloss
+from .scene.lighting import HDRI, SKY, SUNS, WORLD, apply_light, follow_light, show_gloss
 from .scene.read import SELF, VISIBLE
 
 RAYS, TOLERANCE, COLLECTION = "RAYS", "TOLERANCE", "COLLECTION"
@@ -24,6 +32,17 @@ RESOLUTION, DENSITY, FIT = "RESOLUTION", "DENSITY", "FIT"
 def _light_changed(settings: NeuralGashSettings, _context: bpy.types.Context) -> None:
     """A light slider moved: only the light constants of the previews change."""
     apply_light(settings.id_data)
+
+
+def _source_changed(settings: NeuralGashSettings, _context: bpy.types.Context) -> None:
+    """Light from elsewhere: take it at once."""
+    follow_light(settings.id_data)
+
+
+def _file_changed(settings: NeuralGashSettings, _context: bpy.types.Context) -> None:
+    """Another image file."""
+    if settings.light_source == HDRI:
+        follow_light(settings.id_data)
 
 
 def _gloss_changed(settings: NeuralGashSettings, _context: bpy.types.Context) -> None:
@@ -93,6 +112,19 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
     texture_folder: StringProperty(  # type: ignore[valid-type]
         name="Folder", default="", subtype="DIR_PATH", options={"PATH_SUPPORTS_BLEND_RELATIVE"},
         description="Where to write the textures as OpenEXR files; leave empty to pack them into the .blend file")
+    light_source: EnumProperty(  # type: ignore[valid-type]
+        name="From", description="Where the light of the previews is taken from", default=WORLD,
+        update=_source_changed,
+        items=[(WORLD, "World", "The World of the scene and its sun lamps; previews follow their changes"),
+               (HDRI, "Image File", "An equirectangular image, and no lamps; the World of the scene stays as it is"),
+               (SUNS, "Sun Lamps", "The sun lamps of the scene alone; previews follow their changes"),
+               (SKY, "Sky Colour", "An even sky of one colour, also from below")])
+    hdri: StringProperty(  # type: ignore[valid-type]
+        name="File", default="", subtype="FILE_PATH", options={"PATH_SUPPORTS_BLEND_RELATIVE"}, update=_file_changed,
+        description="Equirectangular image that lights the previews, as an .exr or .hdr")
+    sky: FloatVectorProperty(  # type: ignore[valid-type]
+        name="Colour", default=(1.0, 1.0, 1.0), size=3, subtype="COLOR", min=0.0, max=1e9, soft_max=1.0,
+        update=_source_changed, description="Radiance of the even sky")
     light_rotation: FloatProperty(  # type: ignore[valid-type]
         name="Rotation", default=0.0, subtype="ANGLE", soft_min=-math.pi, soft_max=math.pi,
         description="Turn the light of the previews about the vertical axis", update=_light_changed)

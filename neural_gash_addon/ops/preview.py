@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Clear, Preview and Light from World."""
+"""Clear, Preview and Read Again (the light)."""
 from __future__ import annotations
 
 import bpy
@@ -8,6 +8,7 @@ from ..backend.errors import UserError
 from ..scene.attributes import clear, has_bake
 from ..scene.lighting import apply_light, light_object, take_light
 from ..scene.preview import is_on, preview_off, preview_on
+from ..scene.world import forget_image
 from . import state
 
 
@@ -80,15 +81,16 @@ class NEURAL_GASH_OT_preview(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class NEURAL_GASH_OT_light_from_world(bpy.types.Operator):
-    """Light the previews by the World as it is now, and by the sun lamps"""
+class NEURAL_GASH_OT_read_light(bpy.types.Operator):
+    """Read the light of the previews again, also the pixels of the World's image, which may have been painted on"""
 
-    bl_idname = "neural_gash.light_from_world"
-    bl_label = "Light from World"
+    bl_idname = "neural_gash.read_light"
+    bl_label = "Read Again"
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Project the World once; the sliders turn and scale the result."""
+        """Forget what is known, and project it again; the sliders turn and scale the result."""
+        forget_image()
         try:
             take_light(context.scene)
         except UserError as error:

@@ -15,6 +15,7 @@ from ..properties import COLLECTION, DENSITY, FIT, RAYS, TEXTURE, NeuralGashSett
 from ..scene import staleness
 from ..scene.attributes import RECORD, has_bake
 from ..scene.gloss_bounce import bounces_shown, has_bounces
+from ..scene.lighting import HDRI, SKY, problem
 from ..scene.preview import is_on
 
 
@@ -98,7 +99,15 @@ class NEURAL_GASH_PT_light(_Panel, bpy.types.Panel):
         layout = self.layout
         layout.use_property_split = True
         settings = context.scene.neural_gash
-        layout.operator("neural_gash.light_from_world", icon="WORLD")
+        layout.prop(settings, "light_source")
+        if settings.light_source == HDRI:
+            layout.prop(settings, "hdri")
+        elif settings.light_source == SKY:
+            layout.prop(settings, "sky")
+        else:
+            layout.operator("neural_gash.read_light", icon="FILE_REFRESH")
+        if problem(context.scene):
+            layout.label(text=problem(context.scene), icon="ERROR")
         layout.prop(settings, "light_rotation")
         layout.prop(settings, "light_strength")
         layout.prop(settings, "soften")

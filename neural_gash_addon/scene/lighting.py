@@ -1,6 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The light of a scene's previews: taken from the World once, then only turned and scaled."""
+"""The light of a scene's previews: kept with the scene as coefficients, which follow where it is taken from.
+
+The dependency graph says when the World, a lamp or an image changed; an update then costs a projection of what is
+new, and a few numbers for each preview. Nothing is polled.
+"""
 from __future__ import annotations
+
+from pathlib import Path
 
 import bpy
 import numpy as np
@@ -12,19 +18,64 @@ from ..backend.errors import UserError
 from .attributes import has_bake, read_record
 from .frames import as_array, bake_frame
 from .preview import is_glossy, is_on, preview_on, update_light
-from .world import rotated_light, world_light
+from .world import checked, current_depsgraph, file_light, forget_image, rotated_light, suns_light, world_light
+
+WORLD, HDRI, SUNS, SKY = "WORLD", "HDRI", "SUNS", "SKY"  # where light is taken from
 
 _turns: dict[int, bytes] = {}  # session uid of an object -> its rotation when its preview was last lit for turning
+_problems: dict[int, str] = {}  # session uid of a scene -> why its light cannot be read
 _LIGHT = "neural_gash_light"  # custom property of the scene: (K, 3) of the highest order, flat
 
 
-def take_light(scene: bpy.types.Scene) -> None:
-    """Project the scene's World and suns, and keep the coefficients with the scene.
+def take_light(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
+    """Project the light that the scene's settings choose, and keep the coefficients with the scene.
 
+    Args:
+        depsgraph: of the scene, evaluated, where a handler has one.
     Raises:
-        UserError: the World is made of something that cannot be read as light.
+        UserError: the World is made of something that cannot be read as light, or so is the chosen file.
     """
-    store_light(scene, world_light(scene, sh.MAX_ORDER))
+    try:
+        light = _chosen_light(scene, depsgraph)
+    except UserError as error:
+        _problems[scene.session_uid] = str(error)
+        raise
+    _problems.pop(scene.session_uid, None)
+    store_light(scene, light)
+
+
+def _chosen_light(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None) -> np.ndarray:
+    """(K, 3) of the highest order."""
+    settings = scene.neural_gash
+    if settings.light_source == HDRI:
+        if not settings.hdri:
+            raise UserError("Choose the image file that lights the previews.")
+        return checked(file_light(Path(bpy.path.abspath(settings.hdri)), sh.MAX_ORDER))
+    if settings.light_source == SKY:
+        return checked(sh_light.constant(np.array(settings.sky), sh.MAX_ORDER))
+    if settings.light_source == SUNS:
+        return checked(suns_light(depsgraph or current_depsgraph(scene), sh.MAX_ORDER))
+    return world_light(scene, sh.MAX_ORDER, depsgraph)
+
+
+def follow_light(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
+    """Take the light again, and light every preview in the scene if it is another.
+
+    Where it cannot be read, the previews keep the light they have, and `problem` says why.
+    """
+    before = scene.get(_LIGHT)
+    before = None if before is None else before[:]
+    try:
+        take_light(scene, depsgraph)
+    except UserError:
+        return
+    if before is None or before != scene[_LIGHT][:]:
+        apply_light(scene)
+
+
+def problem(scene: bpy.types.Scene) -> str:
+    """Why the light of the previews could not be followed when last it changed; '' where it could."""
+    return _problems.get(scene.session_uid, "")
 
 
 def store_light(scene: bpy.types.Scene, light: np.ndarray) -> None:
@@ -65,19 +116,44 @@ def _on_change(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
                 light_object(scene, obj)
 
 
+@persistent
+def _on_light(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    """Follow the World, the suns and the image of the World, where a preview shows them."""
+    if _LIGHT not in scene or scene.neural_gash.light_source not in (WORLD, SUNS):
+        return  # a scene from which no light was taken may yet have objects of one from which it was
+    changed = [update.id.original for update in depsgraph.updates]
+    if not any(map(_may_light, changed)):
+        return
+    for image in changed:
+        if isinstance(image, bpy.types.Image):
+            forget_image(image)
+    if any(map(is_on, scene.objects)):
+        follow_light(scene, depsgraph)
+
+
+def _may_light(changed: bpy.types.ID) -> bool:
+    """Whether a change of this may be one of the light; scenes and collections hide lamps and change Worlds."""
+    return (isinstance(changed, (bpy.types.World, bpy.types.Light, bpy.types.Image, bpy.types.Scene,
+                                 bpy.types.Collection))
+            or isinstance(changed, bpy.types.Object) and changed.type in ("LIGHT", "EMPTY"))  # empties make instances
+
+
 def register() -> None:
-    """Start following objects that turn."""
-    bpy.app.handlers.depsgraph_update_post.append(_on_change)
-    bpy.app.handlers.frame_change_post.append(_on_change)
+    """Start following objects that turn, and the light."""
+    bpy.app.handlers.depsgraph_update_post.extend((_on_change, _on_light))
+    bpy.app.handlers.frame_change_post.extend((_on_change, _on_light))
     bpy.app.handlers.load_post.append(_on_load)
 
 
 def unregister() -> None:
     """Stop."""
-    bpy.app.handlers.depsgraph_update_post.remove(_on_change)
-    bpy.app.handlers.frame_change_post.remove(_on_change)
+    for handlers in (bpy.app.handlers.depsgraph_update_post, bpy.app.handlers.frame_change_post):
+        handlers.remove(_on_change)
+        handlers.remove(_on_light)
     bpy.app.handlers.load_post.remove(_on_load)
     _turns.clear()
+    _problems.clear()
+    forget_image()
 
 
 def show_gloss(scene: bpy.types.Scene) -> None:
@@ -94,6 +170,8 @@ def show_gloss(scene: bpy.types.Scene) -> None:
 @persistent
 def _on_load(*_: object) -> None:
     """The images of glossy previews are not saved: fill them again."""
+    _problems.clear()
+    forget_image()
     for scene in bpy.data.scenes:
         for obj in scene.objects:
             if is_glossy(obj):

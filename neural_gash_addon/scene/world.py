@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The light of a scene as SH coefficients: its World and its sun lamps."""
+"""The light of a scene as SH coefficients: its World and its sun lamps, or an image file."""
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import bpy
 import numpy as np
@@ -17,23 +18,59 @@ from .evaluation import shown_objects
 Array = NDArray[np.float64]
 
 _BRIGHTEST = 1e24  # beyond, products with the strength leave float32, as which shaders have them
+_projected: dict[tuple, Array] = {}  # of the World's image as last read, by what tells it from others
 
 
-def world_light(scene: bpy.types.Scene, order: int) -> Array:
+def world_light(scene: bpy.types.Scene, order: int, depsgraph: bpy.types.Depsgraph | None = None) -> Array:
     """Light (K, 3) from the World and the visible sun lamps of a scene, in world axes.
 
     The World is an equirectangular environment texture with its mapping's rotation and the
     background's strength, or a plain colour; without a World there is none of it.
 
+    Args:
+        depsgraph: of the scene, evaluated, where a handler has one; else the view layer's, brought up to date.
     Raises:
         UserError: the World is made of something else, or its image cannot be read.
     """
-    total = _background(scene.world, order)
-    for direction, irradiance in _suns(scene):
+    depsgraph = depsgraph or current_depsgraph(scene)
+    total = _background(scene.world and scene.world.evaluated_get(depsgraph), order)
+    return checked(total + suns_light(depsgraph, order))
+
+
+def current_depsgraph(scene: bpy.types.Scene) -> bpy.types.Depsgraph:
+    """The dependency graph of the view layer that is looked at, brought up to date."""
+    layer = bpy.context.view_layer if bpy.context.scene == scene else scene.view_layers[0]
+    layer.update()
+    return layer.depsgraph
+
+
+def suns_light(depsgraph: bpy.types.Depsgraph, order: int) -> Array:
+    """Light (K, 3) of the visible sun lamps alone."""
+    total = sh_light.constant(np.zeros(3), order)
+    for direction, irradiance in _suns(depsgraph):
         total += sh_light.sun(direction, irradiance, order)
-    if not np.abs(total).max() < _BRIGHTEST:  # also where it is not a number
-        raise UserError("The World or a sun lamp has a strength or colour that is infinite or not a number.")
     return total
+
+
+def checked(light: Array) -> Array:
+    """The light. Raises UserError where it is infinite or not a number."""
+    if not np.abs(light).max() < _BRIGHTEST:  # also where it is not a number
+        raise UserError("The World or a sun lamp has a strength or colour that is infinite or not a number.")
+    return light
+
+
+def file_light(path: Path, order: int) -> Array:
+    """Light (K, 3) of an equirectangular image file. Raises UserError where it cannot be read."""
+    if not path.is_file():
+        raise UserError(f"There is no HDRI file '{path}'.")
+    try:
+        image = bpy.data.images.load(str(path.absolute()))
+    except RuntimeError as error:
+        raise UserError(f"The HDRI '{path}' cannot be read: {str(error).strip().removeprefix('Error: ')}") from error
+    try:
+        return sh_light.project_equirect(linear_pixels(image), order)
+    finally:
+        bpy.data.images.remove(image)
 
 
 def rotated_light(light: NDArray, rotation: float, strength: float = 1.0) -> Array:
@@ -75,11 +112,27 @@ def _background(world: bpy.types.World | None, order: int) -> Array:
     if colour.image is None:
         raise UserError(f"The Environment Texture of the World '{world.name}' has no image.")
     try:
-        pixels = linear_pixels(colour.image)
+        light = _image_light(colour.image.original, order)
     except UserError as error:
         raise UserError(f"The World '{world.name}' cannot be read as light: {error}") from error
-    image = sh_light.project_equirect(pixels, order)
-    return strength * sh.rotate(image, rotation)
+    return strength * sh.rotate(light, rotation)
+
+
+def _image_light(image: bpy.types.Image, order: int) -> Array:
+    """Light (K, 3) of an image as it lies. Kept, as reading one takes a tenth of a second or more."""
+    key = (image.session_uid, order, image.filepath, image.source, tuple(image.size), image.alpha_mode,
+           image.colorspace_settings.name)
+    if key not in _projected:
+        light = sh_light.project_equirect(linear_pixels(image), order)
+        _projected.clear()
+        _projected[key] = light
+    return _projected[key]
+
+
+def forget_image(image: bpy.types.Image | None = None) -> None:
+    """Read an image anew when it is next wanted, as its pixels may have changed; None: whichever is kept."""
+    if image is None or any(key[0] == image.session_uid for key in _projected):
+        _projected.clear()
 
 
 def _source(socket: bpy.types.NodeSocket) -> bpy.types.Node | None:
@@ -168,13 +221,13 @@ def linear_pixels(image: bpy.types.Image) -> NDArray[np.float32]:
     return np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4)
 
 
-def _suns(scene: bpy.types.Scene) -> list[tuple[Array, Array]]:
+def _suns(depsgraph: bpy.types.Depsgraph) -> list[tuple[Array, Array]]:
     """(direction to it (3,), irradiance (3,) W/m^2 on a facing plane) of each visible sun lamp."""
-    layer = bpy.context.view_layer if bpy.context.scene == scene else scene.view_layers[0]
-    layer.update()
-    suns = []
-    shown = shown_objects(layer)
-    for instance in layer.depsgraph.object_instances:
+    suns: list[tuple[Array, Array]] = []
+    if not any(lamp.type == "SUN" for lamp in bpy.data.lights):
+        return suns  # a scene may have very many instances
+    shown = shown_objects(depsgraph.view_layer)
+    for instance in depsgraph.object_instances:
         lamp = instance.object
         if lamp.type != "LIGHT" or lamp.data.type != "SUN":
             continue

@@ -82,7 +82,7 @@ def test_light_follows_an_object_that_turns(make, settings):
     bpy.context.view_layer.update()
     turned = _light(obj)
     assert np.abs(turned - before).max() > 0.1
-    bpy.ops.neural_gash.light_from_world()
+    bpy.ops.neural_gash.read_light()
     np.testing.assert_allclose(_light(obj), turned, atol=1e-6)
     obj.rotation_euler = (0, 0, 0)
     bpy.context.view_layer.update()

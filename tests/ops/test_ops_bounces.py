@@ -81,6 +81,7 @@ def test_the_picture_is_the_numbers(room):
     _bake()
     light = np.random.default_rng(0).normal(size=(25, 3))
     light[0] = 5
+    bpy.context.scene.neural_gash.light_source = "SKY"  # which nothing changes
     store_light(bpy.context.scene, light)
     apply_light(bpy.context.scene)
     camera = bpy.data.objects.new("Eye", bpy.data.cameras.new("Eye"))

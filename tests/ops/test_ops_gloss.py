@@ -32,6 +32,7 @@ def _light(seed=0):
     from neural_gash_addon.scene.lighting import apply_light, store_light
     lamp = np.random.default_rng(seed).normal(size=(25, 3))
     lamp[0] = 6
+    bpy.context.scene.neural_gash.light_source = "SKY"  # which nothing changes
     store_light(bpy.context.scene, lamp)
     apply_light(bpy.context.scene)
     return lamp

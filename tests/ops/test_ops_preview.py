@@ -72,6 +72,7 @@ def test_sliders_only_turn_and_scale_the_light(make, settings, monkeypatch):
     obj = make(*WEDGE)
     bpy.ops.neural_gash.bake()
     light = np.random.default_rng(3).normal(size=(25, 3))
+    bpy.context.scene.neural_gash.light_source = "SKY"  # which nothing changes
     lighting.store_light(bpy.context.scene, light)
     monkeypatch.setattr(lighting, "world_light", lambda *_: pytest.fail("projected again"))
     materials = [m.name for m in bpy.data.materials]
@@ -89,12 +90,13 @@ def test_windowing_is_off_until_asked_for(make, settings):
     obj = make(*WEDGE)
     bpy.ops.neural_gash.bake()
     light = np.random.default_rng(3).normal(size=(25, 3))
+    bpy.context.scene.neural_gash.light_source = "SKY"  # which nothing changes
     lighting.store_light(bpy.context.scene, light)
     settings.soften = True
     np.testing.assert_allclose(_constants(obj), sh_light.window(light[:9], 3), atol=1e-5)
 
 
-def test_light_from_world_follows_the_world(make, settings):
+def test_read_light_follows_the_world(make, settings):
     obj = make(*WEDGE)
     world = bpy.data.worlds.new("Sky")
     world.color = (1, 0, 0)
@@ -104,7 +106,7 @@ def test_light_from_world_follows_the_world(make, settings):
     bpy.ops.neural_gash.bake()
     np.testing.assert_allclose(_constants(obj)[0], (math.sqrt(4 * math.pi), 0, 0), atol=1e-5)
     bpy.context.scene.world = None
-    assert bpy.ops.neural_gash.light_from_world() == {"FINISHED"}
+    assert bpy.ops.neural_gash.read_light() == {"FINISHED"}
     np.testing.assert_allclose(_constants(obj), 0, atol=1e-7)
 
 
@@ -114,4 +116,4 @@ def test_unreadable_world_is_one_sentence(make, settings, refused):
     tree = world.node_tree
     tree.links.new(tree.nodes.new("ShaderNodeTexSky").outputs[0], tree.nodes["Background"].inputs["Color"])
     bpy.context.scene.world = world
-    assert "Sky" in refused(bpy.ops.neural_gash.light_from_world)
+    assert "Sky" in refused(bpy.ops.neural_gash.read_light)

@@ -42,7 +42,7 @@ def test_every_setting_and_operator_is_described(addon):
         for item in getattr(prop, "enum_items", ()):
             assert item.description and not item.description.endswith("."), item.identifier
     names = [name for name in dir(bpy.ops.neural_gash) if not name.startswith("_")]
-    assert {"bake", "bake_applied_copy", "clear", "light_from_world", "preview"} <= set(names)
+    assert {"bake", "bake_applied_copy", "clear", "read_light", "preview"} <= set(names)
     for name in names:
         kind = getattr(bpy.ops.neural_gash, name).get_rna_type()
         assert len(kind.description) > 15, name

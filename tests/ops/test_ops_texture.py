@@ -177,6 +177,7 @@ def test_render_equals_the_numbers(make, texture):
     _bake()
     rng = np.random.default_rng(0)
     lamp = light.constant(np.ones(3), 5) + 0.3 * rng.normal(size=(25, 3))
+    bpy.context.scene.neural_gash.light_source = "SKY"  # which nothing changes
     store_light(bpy.context.scene, lamp)
     apply_light(bpy.context.scene)
     camera = bpy.data.objects.new("Eye", bpy.data.cameras.new("Eye"))

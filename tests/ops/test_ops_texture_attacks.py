@@ -171,7 +171,7 @@ def test_infinite_pixels_of_the_world_are_refused(make, texture, refused):
     world.node_tree.links.new(sky.outputs[0], world.node_tree.nodes["Background"].inputs[0])
     texture.gloss, texture.light_strength = True, math.inf
     _bake(make(*FLOOR))  # with a warning
-    assert "infinite" in refused(bpy.ops.neural_gash.light_from_world)
+    assert "infinite" in refused(bpy.ops.neural_gash.read_light)
     assert all(np.isfinite(_pixels(image)).all() for image in bpy.data.images if image != sky.image)
 
 
@@ -202,7 +202,7 @@ def test_glossy_previews_that_were_damaged_are_made_anew(make, texture, damage):
             image.scale(8, 8)
     if damage == "sockets":
         bpy.data.node_groups[0].interface.clear()
-    bpy.ops.neural_gash.light_from_world()
+    bpy.ops.neural_gash.read_light()
     lit = [i for i in bpy.data.images if "gloss" in i.name]
     assert len(lit) == 8 and any(_pixels(i).any() for i in lit) and len(bpy.data.node_groups) == 1
 
@@ -213,7 +213,7 @@ def test_previews_whose_group_lost_its_inputs_are_made_anew(make, texture, targe
     _bake(make(*FLOOR))
     bpy.data.node_groups[0].interface.clear()
     texture.light_rotation = 0.5
-    bpy.ops.neural_gash.light_from_world()
+    bpy.ops.neural_gash.read_light()
     assert len(bpy.data.node_groups) == 1 and "L8" in bpy.data.node_groups[0].interface.items_tree
 
 

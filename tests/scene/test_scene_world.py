@@ -12,7 +12,7 @@ from mathutils import Euler  # noqa: E402
 from neural_gash_addon.backend import light as sh_light  # noqa: E402
 from neural_gash_addon.backend import spherical_harmonics as sh  # noqa: E402
 from neural_gash_addon.backend.errors import UserError  # noqa: E402
-from neural_gash_addon.scene.world import rotated_light, world_light  # noqa: E402
+from neural_gash_addon.scene.world import forget_image, rotated_light, world_light  # noqa: E402
 
 
 def _world(strength=1.0, colour=(0.2, 0.5, 1.0)):
@@ -152,10 +152,13 @@ def test_alpha_darkens_colours_but_not_numbers_as_in_cycles(render, camera, tmp_
                                rtol=0.01, atol=0.005)  # eight bits
 
 
-def test_image_is_read_anew_when_it_changes():
+def test_image_is_read_anew_when_it_is_forgotten():
     _, texture = _environment(np.ones((2, 4, 3)))
     before = world_light(bpy.context.scene, 2)
     texture.image.pixels.foreach_set(np.full(32, 2, np.float32))
+    forget_image(bpy.data.images.new("Another", 1, 1))
+    np.testing.assert_array_equal(world_light(bpy.context.scene, 2), before)
+    forget_image(texture.image)
     np.testing.assert_allclose(world_light(bpy.context.scene, 2), 2 * before, atol=1e-6)
 
 
