@@ -82,7 +82,7 @@ class NEURAL_GASH_OT_preview(bpy.types.Operator):
 
 
 class NEURAL_GASH_OT_read_light(bpy.types.Operator):
-    """Read the light of the previews again, also the pixels of the World's image, which may have been painted on"""
+    """Read the light of the previews again, also the pixels of its image, which may have been painted on"""
 
     bl_idname = "neural_gash.read_light"
     bl_label = "Read Again"

@@ -102,7 +102,7 @@ class NEURAL_GASH_PT_light(_Panel, bpy.types.Panel):
         layout.prop(settings, "light_source")
         if settings.light_source == HDRI:
             layout.prop(settings, "hdri")
-        elif settings.light_source == SKY:
+        if settings.light_source == SKY:
             layout.prop(settings, "sky")
         else:
             layout.operator("neural_gash.read_light", icon="FILE_REFRESH")

@@ -181,6 +181,7 @@ def session():
     yield from build()
     yield from cancelled()
     yield from baked()
+    yield from followed()
     yield from reopened()
     yield from textured()
     yield from deleted()
@@ -300,6 +301,31 @@ def baked():
     expect(len(bpy.data.materials) == materials, "slider_makes_no_materials")
     yield 2
     yield from picture("6_turned")
+    settings().light_rotation = 0.0
+
+
+def followed():
+    """The sun is turned, the World made brighter, and both undone: the preview follows on its own."""
+    sun = next(o for o in bpy.data.objects if o.type == "LIGHT")
+    strength = bpy.context.scene.world.node_tree.nodes["Background"].inputs["Strength"]
+    first = light()
+    with in_view():
+        bpy.ops.ed.undo_push(message="Before the sun is turned")
+    for angle in np.linspace(0.6, -0.9, 9)[1:]:
+        sun.rotation_euler[0] = float(angle)
+        yield 0.1
+    turned = light()
+    expect(not np.allclose(turned, first), "a_sun_is_followed")
+    strength.default_value = 8.0
+    yield 0.3
+    expect(not np.allclose(light(), turned), "the_world_is_followed")
+    yield 2
+    yield from picture("6b_followed")
+    with in_view():
+        bpy.ops.ed.undo_push(message="Sun turned")
+    press("Z", ctrl=True)
+    yield 1.0
+    expect(np.allclose(light(), first, atol=1e-5), "undo_takes_the_light_back")
     view3d()[1].spaces.active.shading.type = "SOLID"
 
 
