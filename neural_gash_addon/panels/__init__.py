@@ -11,6 +11,7 @@ from ..backend.methods import METHODS
 from ..backend.record import BakeRecord
 from ..ops import state
 from ..ops.job import percent
+from ..ops.preset import PRESETS, in_force
 from ..properties import COLLECTION, DENSITY, FIT, RAYS, TEXTURE, NeuralGashSettings
 from ..scene import staleness
 from ..scene.attributes import RECORD, has_bake
@@ -51,6 +52,10 @@ class NEURAL_GASH_PT_main(_Panel, bpy.types.Panel):
         column = layout.column()
         column.scale_y = 1.6
         column.operator("neural_gash.bake", icon="RENDER_STILL")
+        row = layout.row(align=True)
+        chosen = in_force(context.scene.neural_gash)
+        for name, (label, *_) in PRESETS.items():
+            row.operator("neural_gash.preset", text=label, depress=name == chosen).preset = name
         if obj is not None and obj.type == "MESH" and obj.modifiers:
             layout.operator("neural_gash.bake_applied_copy", icon="DUPLICATE")
         row = layout.row(align=True)
