@@ -66,8 +66,8 @@ def _parser() -> argparse.ArgumentParser:
     bake.add_argument("--object", metavar="NAME", action="append", dest="objects",
                       help="which object; needed where the file has several meshes. Give it again to bake several "
                            "together, which shadow each other")
-    bake.add_argument("--method", choices=list(methods.METHODS), default="embree", metavar="METHOD",
-                      help="; ".join(f"{m.name}: {m.label}" for m in methods.METHODS.values()) + " (embree)")
+    bake.add_argument("--method", choices=list(methods.METHODS), default="auto", metavar="METHOD",
+                      help="; ".join(f"{m.name}: {m.label}" for m in methods.METHODS.values()) + " (auto)")
     bake.add_argument("--order", type=int, default=3, help="bands of spherical harmonics, 2 to 5 (3)")
     quality = bake.add_mutually_exclusive_group()
     quality.add_argument("--rays", type=int, help="rays from every point")

@@ -54,7 +54,7 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
     """Settings of the next bake, and the light of the previews."""
 
     method: EnumProperty(  # type: ignore[valid-type]
-        name="Method", description="How the transfer is computed", default="embree",
+        name="Method", description="How the transfer is computed", default="auto",
         items=[(m.name, m.label, m.description) for m in METHODS.values()])
     order: IntProperty(  # type: ignore[valid-type]
         name="Order", default=3, min=MIN_ORDER, max=MAX_ORDER,

@@ -33,6 +33,7 @@ _FEWEST = 96
 PILOT_RAYS = 64              # of each of two traces
 _PILOT_SETS = 4
 _SAFE = 1.2                  # what the pilot's estimates may be too low by
+_MARGIN = 0.95               # of a tolerance, for who stops at its own measure: it stops where that is a little too low
 _FEW_RAYS = (4, 8, 16, 32)   # of plain bakes below what an adaptive one takes at least, 64
 _HYBRID_ERROR = 0.6          # of the hybrid's error to a plain bake's at equal rays (SRR 0.2-0.35 on 29 meshes)
 _HYBRID_SECONDS = 2e-3       # ... and what it costs besides: at all,
@@ -138,16 +139,17 @@ def choose(found: Pilot, points: int, tolerance: float) -> Plan:
 
 def plans(found: Pilot, points: int, tolerance: float) -> list[Plan]:
     """Every plan that is expected to meet the tolerance by tracing."""
-    out = [Plan("embree", tolerance=tolerance, reason="Rays from every point, more where shadows are harder, are the "
+    measured = _MARGIN * tolerance
+    out = [Plan("embree", tolerance=measured, reason="Rays from every point, more where shadows are harder, are the "
                                                       f"quickest way to {_percent(tolerance)}.")]
     enough = [rays for rays in _FEW_RAYS if _SAFE * noise_of(found, rays) <= tolerance]
     if enough:
         out.append(Plan("embree", rays=enough[0], reason=f"Shadows are {_percent(found.blocked)} of the whole, so "
                         f"{enough[0]} rays a point are enough for {_percent(tolerance)}."))
-    out.append(Plan("hybrid", tolerance=tolerance, reason=f"{hybrid_rays(found, tolerance)} rays a point, averaged "
+    out.append(Plan("hybrid", tolerance=measured, reason=f"{hybrid_rays(found, measured)} rays a point, averaged "
                     f"over neighbours by the network, are enough for {_percent(tolerance)}."))
     if points >= SPARSE_POINTS:
-        out.append(Plan("sparse", tolerance=tolerance, reason=f"{points:,} points are dense: some are traced, and the "
+        out.append(Plan("sparse", tolerance=measured, reason=f"{points:,} points are dense: some are traced, and the "
                                                               "others read off them."))
     return out
 

@@ -49,7 +49,7 @@ def settings():
     """The scene's settings, made quick."""
     import bpy
     chosen = bpy.context.scene.neural_gash
-    chosen.quality, chosen.rays = "RAYS", 64
+    chosen.method, chosen.quality, chosen.rays = "embree", "RAYS", 64
     return chosen
 
 
