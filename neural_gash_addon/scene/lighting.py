@@ -12,6 +12,7 @@ from ..backend.errors import UserError
 from .attributes import has_bake, read_record
 from .frames import as_array, bake_frame
 from .preview import is_glossy, is_on, preview_on, update_light
+from .views import LIT, view_light
 from .world import rotated_light, world_light
 
 _turns: dict[int, bytes] = {}  # session uid of an object -> its rotation when its preview was last lit for turning
@@ -103,6 +104,10 @@ def _on_load(*_: object) -> None:
 def light_object(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
     """Light the preview of one object, where it is on."""
     try:
-        update_light(obj, current_light(scene, read_record(obj).order))
+        record, view = read_record(obj), scene.neural_gash.view
+        if view == LIT:
+            update_light(obj, current_light(scene, record.order))
+        else:
+            update_light(obj, view_light(obj, record, view, scene.neural_gash.coefficient), tint=0.0)
     except UserError:
         return  # the panel says that the bake is damaged
