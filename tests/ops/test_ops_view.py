@@ -103,11 +103,17 @@ def test_without_errors_or_viewport_it_says_so(make, refused):
         assert "3D Viewport" in refused(bpy.ops.neural_gash.show_errors)
 
 
-def test_glossy_previews_are_dull_in_a_view(settings):
-    settings.gloss = True
-    assert settings.lobe_shown() == "GGX"
-    settings.view = "OCCLUSION"
-    assert settings.lobe_shown() == ""
+def test_glossy_previews_are_dull_in_a_view(make, settings):
+    from neural_gash_addon.scene.preview import is_glossy, is_on
+    obj = make()
+    settings.target, settings.side, settings.method, settings.gloss = "TEXTURE", 32, "analytic", True
+    bpy.ops.neural_gash.bake()
+    assert is_glossy(obj)
+    for view in ("OCCLUSION", "COEFFICIENT"):
+        settings.view = view
+        assert is_on(obj) and not is_glossy(obj)
+    settings.view = "LIT"
+    assert is_glossy(obj)
 
 
 def test_numbers_have_units(settings):
