@@ -40,6 +40,7 @@ from .scene.gloss import can_gloss
 from .scene.preview import preview_on
 from .scene.read import make_applied_copy
 from .scene.render import render_preview, silent_blender
+from .scene.views import LIT
 from .scene.world import file_light, rotated_light
 
 OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -190,6 +191,7 @@ def _bake(arguments: argparse.Namespace) -> tuple[list[dict], str]:
         settings.texture_folder = str(arguments.textures.absolute()) if arguments.textures else ""
     else:
         settings.target = VERTICES
+    settings.view = LIT
     if arguments.gloss:
         settings.gloss, settings.lobe = True, arguments.gloss.upper()
     if arguments.applied_copy:
@@ -264,6 +266,7 @@ def _relight(arguments: argparse.Namespace) -> tuple[list[dict], str]:
                 raise UserError(lighting.problem(scene))
         scene.neural_gash.light_rotation = turn[0]
         _set(scene.neural_gash, "light_strength", turn[1])
+        scene.neural_gash.view = LIT
         preview_on(obj, arguments.gloss.upper() if arguments.gloss else "")
         lighting.light_object(scene, obj)
         if arguments.png:

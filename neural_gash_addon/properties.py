@@ -23,6 +23,7 @@ from .backend.methods import METHODS, MIN_ORDER, MIN_TOLERANCE
 from .backend.spherical_harmonics import MAX_ORDER
 from .scene.lighting import HDRI, SKY, SUNS, WORLD, apply_light, follow_light, show_gloss
 from .scene.read import SELF, VISIBLE
+from .scene.views import COEFFICIENT, LIT, OCCLUSION
 
 RAYS, TOLERANCE, COLLECTION = "RAYS", "TOLERANCE", "COLLECTION"
 VERTICES, TEXTURE = "VERTICES", "TEXTURE"
@@ -50,6 +51,14 @@ def _gloss_changed(settings: NeuralGashSettings, _context: bpy.types.Context) ->
     show_gloss(settings.id_data)
 
 
+def _view_changed(settings: NeuralGashSettings, _context: bpy.types.Context) -> None:
+    """The previews show something else: another light; glossy ones become dull, for what a bake holds is dull."""
+    if settings.gloss:
+        show_gloss(settings.id_data)
+    else:
+        apply_light(settings.id_data)
+
+
 class NeuralGashSettings(bpy.types.PropertyGroup):
     """Settings of the next bake, and the light of the previews."""
 
@@ -65,11 +74,12 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
         items=[(TOLERANCE, "Tolerance", "Trace until the error is as small as asked for, and no longer"),
                (RAYS, "Rays", "Trace the same number of rays from every point")])
     tolerance: FloatProperty(  # type: ignore[valid-type]
-        name="Tolerance", default=0.02, min=MIN_TOLERANCE, max=1.0, soft_min=0.002, soft_max=0.2, precision=4,
+        name="Tolerance", subtype="FACTOR", default=0.02, min=MIN_TOLERANCE, max=1.0, soft_min=0.002, soft_max=0.2,
+        precision=4,
         description="Error to reach, as a part of the whole: 0.02 is 2 percent. Half of it takes about two and "
                     "a half times as long")
     rays: IntProperty(  # type: ignore[valid-type]
-        name="Rays", default=256, min=1, max=16 * MAX_RAYS, soft_max=MAX_RAYS,
+        name="Rays per Point", default=256, min=1, max=16 * MAX_RAYS, soft_max=MAX_RAYS,
         description="Rays to trace from every point")
     occluders: EnumProperty(  # type: ignore[valid-type]
         name="Occluders", description="What casts shadows on the object", default=SELF,
@@ -140,6 +150,17 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
         update=_gloss_changed,
         items=[(GGX, "GGX", "Microfacets: a bright middle and wide tails, as in Blender's own shaders"),
                (PHONG, "Phong", "A power of the cosine, (1/roughness^4 - 1)/2: as wide, without the tails")])
+    view: EnumProperty(  # type: ignore[valid-type]
+        name="View", description="What the previews show", default=LIT, update=_view_changed,
+        items=[(LIT, "Lit", "The materials under the light, as they shall be seen"),
+               (OCCLUSION, "Ambient Occlusion", "The bake under an even white sky, without the materials' colours: "
+                                                "white is open to all of it, black to nothing"),
+               (COEFFICIENT, "Coefficient", "One number of the bake, without the materials' colours: red where it is "
+                                            "positive, blue where it is negative, black where it is zero")])
+    coefficient: IntProperty(  # type: ignore[valid-type]
+        name="Coefficient", default=0, min=0, max=MAX_ORDER ** 2 - 1, update=_view_changed,
+        description="Which number of each point to show: l x (l + 1) + m of band l, counted from 0; 0 is the ambient "
+                    "occlusion")
     soften: BoolProperty(  # type: ignore[valid-type]
         name="Reduce Ringing", default=False, update=_light_changed,
         description="Damp the dark and bright rings that a small bright light leaves at low orders; "
@@ -147,7 +168,7 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
 
     def lobe_shown(self) -> str:
         """The lobe of glossy previews; '' where they are dull."""
-        return self.lobe if self.gloss else ""
+        return self.lobe if self.gloss and self.view == LIT else ""
 
     def occluder_mode(self) -> str:
         """'SELF', 'VISIBLE' or the name of the collection; '' where a collection is wanted and none is chosen."""

@@ -51,6 +51,8 @@ class Worker(threading.Thread):
 class Baking:
     """What the Bake operators share. They differ in what is baked."""
 
+    _doing = "baking"  # what the status line says of it
+
     if TYPE_CHECKING:  # the operator's own
         def report(self, type: set[str], message: str) -> None: ...
 
@@ -89,6 +91,7 @@ class Baking:
         context.window_manager.modal_handler_add(self)
         context.window_manager.progress_begin(0, 100)
         state.start(self._worker)
+        self._say(context)
         self._worker.start()
         return {"RUNNING_MODAL"}
 
@@ -103,10 +106,7 @@ class Baking:
         if self._worker.is_alive():
             state.progress = self._worker.progress
             context.window_manager.progress_update(100 * state.progress)
-            if context.workspace:
-                names = ", ".join(self._batch.names)
-                context.workspace.status_text_set(
-                    f"Baking {names}: {100 * state.progress:.0f} %   (Esc cancels)")
+            self._say(context)
             state.redraw(context)
             return {"RUNNING_MODAL"}
         self._end(context)
@@ -122,6 +122,14 @@ class Baking:
         self._worker.cancel()
         self._end(context)
         self._undo(context)
+
+    def _say(self, context: bpy.types.Context) -> None:
+        """The status line while it works."""
+        if context.workspace:
+            names = self._batch.names
+            what = names[0] if len(names) == 1 else f"{len(names)} objects"
+            context.workspace.status_text_set(
+                f"Neural GASh: {self._doing} {what}, {100 * state.progress:.0f} %. Esc cancels")
 
     def _end(self, context: bpy.types.Context) -> None:
         """Give back timer, status line and progress."""

@@ -76,6 +76,8 @@ class NEURAL_GASH_OT_compare(Baking, bpy.types.Operator):
     bl_label = "Compare Methods on This Mesh"
     bl_options = {"REGISTER", "UNDO"}
 
+    _doing = "comparing methods on"
+
     filepath: StringProperty(  # type: ignore[valid-type]
         name="File", default="", subtype="FILE_PATH", options={"SKIP_SAVE"},
         description="Where to save the chart as a PNG picture as well; leave empty to keep it in the .blend file only")

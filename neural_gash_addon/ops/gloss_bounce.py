@@ -109,7 +109,7 @@ class NEURAL_GASH_OT_bake_gloss(Baking, bpy.types.Operator):
         write_bounces(obj.data, made, transfer.record, job.light, job.finish, job.lobe)
         context.scene.neural_gash.gloss = True
         if not is_glossy(obj):
-            preview_on(obj, context.scene.neural_gash.lobe)
+            preview_on(obj, context.scene.neural_gash.lobe_shown())
         light_object(context.scene, obj)
         self.report({"INFO"}, f"Baked {transfer.record.bounces} glossy bounce"
                     f"{'s' if transfer.record.bounces > 1 else ''} in {transfer.record.seconds:.2f} s.")

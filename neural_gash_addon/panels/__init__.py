@@ -2,6 +2,7 @@
 """The N-panel: layout only. Nothing here reads a mesh."""
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import bpy
@@ -11,13 +12,14 @@ from ..backend.methods import METHODS
 from ..backend.record import BakeRecord
 from ..ops import state
 from ..ops.job import percent
-from ..ops.preset import PRESETS, in_force
+from ..ops.preset import PRESETS, preset_in_force
 from ..properties import COLLECTION, DENSITY, FIT, RAYS, TEXTURE, NeuralGashSettings
 from ..scene import staleness
 from ..scene.attributes import RECORD, has_bake
 from ..scene.gloss_bounce import bounces_shown, has_bounces
 from ..scene.lighting import HDRI, SKY, problem
 from ..scene.preview import is_on
+from ..scene.views import COEFFICIENT, shows_errors
 
 
 @lru_cache(maxsize=64)
@@ -52,10 +54,9 @@ class NEURAL_GASH_PT_main(_Panel, bpy.types.Panel):
         column = layout.column()
         column.scale_y = 1.6
         column.operator("neural_gash.bake", icon="RENDER_STILL")
-        row = layout.row(align=True)
-        chosen = in_force(context.scene.neural_gash)
-        for name, (label, *_) in PRESETS.items():
-            row.operator("neural_gash.preset", text=label, depress=name == chosen).preset = name
+        row, pressed = layout.row(align=True), preset_in_force(context.scene.neural_gash)
+        for preset, (label, _, _) in PRESETS.items():
+            row.operator("neural_gash.preset", text=label, depress=preset == pressed).preset = preset
         if obj is not None and obj.type == "MESH" and obj.modifiers:
             layout.operator("neural_gash.bake_applied_copy", icon="DUPLICATE")
         row = layout.row(align=True)
@@ -126,6 +127,31 @@ class NEURAL_GASH_PT_light(_Panel, bpy.types.Panel):
                 layout.label(text="Glossy bounces are of another light or lobe: not shown", icon="ERROR")
 
 
+class NEURAL_GASH_PT_view(_Panel, bpy.types.Panel):
+    """What the bake holds."""
+
+    bl_idname = "NEURAL_GASH_PT_view"
+    bl_label = "View"
+    bl_parent_id = "NEURAL_GASH_PT_main"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """One click for each view."""
+        layout, settings, obj = self.layout, context.scene.neural_gash, context.object
+        column = layout.column(align=True)
+        column.enabled = is_on(obj)
+        column.prop(settings, "view", expand=True)
+        if settings.view == COEFFICIENT:
+            column.prop(settings, "coefficient")
+            band = math.isqrt(settings.coefficient)
+            record = _record(obj.data[RECORD]) if has_bake(obj) else ""
+            if isinstance(record, BakeRecord) and band >= record.order:
+                layout.label(text=f"The bake has coefficients 0 to {record.order ** 2 - 1}", icon="ERROR")
+            else:
+                layout.label(text=f"l = {band}, m = {settings.coefficient - band * (band + 1)}")
+        layout.operator("neural_gash.show_errors", depress=shows_errors(obj, context.space_data))
+
+
 class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):
     """What the next bake does."""
 
@@ -186,10 +212,11 @@ class NEURAL_GASH_PT_compare(_Panel, bpy.types.Panel):
         self.layout.operator("neural_gash.compare", icon="GRAPH")
         column = self.layout.column(align=True)
         column.label(text="Chart: in the Image Editor", icon="INFO")
-        column.label(text="Errors: Solid shading, Color: Attribute", icon="BLANK1")
+        column.label(text="Errors: in View", icon="BLANK1")
 
 
-CLASSES = (NEURAL_GASH_PT_main, NEURAL_GASH_PT_light, NEURAL_GASH_PT_settings, NEURAL_GASH_PT_compare)
+CLASSES = (NEURAL_GASH_PT_main, NEURAL_GASH_PT_light, NEURAL_GASH_PT_view, NEURAL_GASH_PT_settings,
+           NEURAL_GASH_PT_compare)
 
 
 def register() -> None:

@@ -18,6 +18,7 @@ from ..backend.errors import UserError
 from .attributes import has_bake, read_record
 from .frames import as_array, bake_frame
 from .preview import is_glossy, is_on, preview_on, update_light
+from .views import LIT, view_light
 from .world import checked, current_depsgraph, file_light, forget_image, rotated_light, suns_light, world_light
 
 WORLD, HDRI, SUNS, SKY = "WORLD", "HDRI", "SUNS", "SKY"  # where light is taken from
@@ -181,6 +182,10 @@ def _on_load(*_: object) -> None:
 def light_object(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
     """Light the preview of one object, where it is on."""
     try:
-        update_light(obj, current_light(scene, read_record(obj).order))
+        record, view = read_record(obj), scene.neural_gash.view
+        if view == LIT:
+            update_light(obj, current_light(scene, record.order))
+        else:
+            update_light(obj, view_light(obj, record, view, scene.neural_gash.coefficient), tint=0.0)
     except UserError:
         return  # the panel says that the bake is damaged

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .attributes import PREFIX, attribute_count
 
-GROUP_VERSION = 2  # raise it when the group changes; materials in old files keep the group they have
+GROUP_VERSION = 3  # raise it when the group changes; materials in old files keep the group they have
 # custom properties of the group
 _VERSION, _ORDER, _COLOURS = "neural_gash_version", "neural_gash_order", "neural_gash_colours"
 DEFAULT_ALBEDO = 0.8
@@ -20,8 +20,9 @@ def ensure_group(order: int, colours: int = 1, images: Sequence[bpy.types.Image]
                  ) -> bpy.types.NodeTree:
     """The group `PRT Shading <order>`: made where it is missing or of another version only.
 
-    Inputs Albedo and L0..L{K-1}, one RGB vector for each coefficient of the light; output Shader, an
-    emission. Its light is at first a white sky of radiance 1, which shows ambient occlusion.
+    Inputs Albedo, Tint (how much of the albedo is seen, 0 to 1) and L0..L{K-1}, one RGB vector for each
+    coefficient of the light; output Shader, an emission. Its light is at first a white sky of radiance 1, which
+    shows ambient occlusion.
 
     Args:
         colours: 3 where each coefficient has a red, a green and a blue.
@@ -56,8 +57,13 @@ def group_terms(group: bpy.types.NodeTree) -> tuple[int, int]:
     return int(group[_ORDER]), int(group.get(_COLOURS, 1))
 
 
-def set_light(node: bpy.types.ShaderNodeGroup, light: NDArray) -> None:
-    """Set the light (K, 3), in the bake frame, on a node of the group. Recompiles no shader."""
+def set_light(node: bpy.types.ShaderNodeGroup, light: NDArray, tint: float = 1.0) -> None:
+    """Set the light (K, 3), in the bake frame, on a node of the group, and how much of the albedo is seen.
+
+    Recompiles no shader. Groups in files from before version 3 show all of the albedo.
+    """
+    if "Tint" in node.inputs:
+        node.inputs["Tint"].default_value = tint
     for index, value in enumerate(light.tolist()):
         node.inputs[f"L{index}"].default_value = value
 
@@ -101,6 +107,9 @@ def _build(group: bpy.types.NodeTree, order: int, colours: int, sources: Sources
     terms = order * order
     albedo = group.interface.new_socket("Albedo", in_out="INPUT", socket_type="NodeSocketColor")
     albedo.default_value = (DEFAULT_ALBEDO,) * 3 + (1.0,)
+    tint = group.interface.new_socket("Tint", in_out="INPUT", socket_type="NodeSocketFloat")
+    tint.subtype, tint.default_value, tint.min_value, tint.max_value = "FACTOR", 1.0, 0.0, 1.0
+    tint.description = "How much of the albedo is seen; 0 shows what the bake holds, as on white"
     for index in range(terms):
         socket = group.interface.new_socket(f"L{index}", in_out="INPUT", socket_type="NodeSocketVector")
         socket.default_value = (math.sqrt(4 * math.pi) if index == 0 else 0.0,) * 3
@@ -127,9 +136,14 @@ def _build(group: bpy.types.NodeTree, order: int, colours: int, sources: Sources
         if total is not None:
             group.links.new(total, term.inputs[2])
         total = term.outputs[0]
+    tinted = _add(group, "ShaderNodeMix", -200, 200)
+    tinted.data_type = "RGBA"
+    tinted.inputs[6].default_value = (1.0,) * 4
+    group.links.new(inputs.outputs["Tint"], tinted.inputs[0])
+    group.links.new(inputs.outputs["Albedo"], tinted.inputs[7])
     coloured = _add(group, "ShaderNodeVectorMath", 0, 0)
     coloured.operation = "MULTIPLY"
-    group.links.new(inputs.outputs["Albedo"], coloured.inputs[0])
+    group.links.new(tinted.outputs[2], coloured.inputs[0])
     group.links.new(total, coloured.inputs[1])
     emission = _add(group, "ShaderNodeEmission", 200, 0)
     group.links.new(coloured.outputs[0], emission.inputs["Color"])

@@ -106,12 +106,13 @@ def preview_off(obj: bpy.types.Object) -> None:
     _remove_unused(found)
 
 
-def update_light(obj: bpy.types.Object, light: NDArray) -> None:
+def update_light(obj: bpy.types.Object, light: NDArray, tint: float = 1.0) -> None:
     """Light the preview of `obj`, where it is on. Sets socket values only, so no shader recompiles.
 
     Args:
         light: (K, 3) in world axes, of the bake's order or higher. It is turned into the frame of
             the bake, so the object may have been rotated since.
+        tint: how much of the materials' colours a dull preview shows.
     Raises:
         UserError: the record of the bake is damaged.
         ValueError: the light is of a lower order than the bake.
@@ -138,7 +139,7 @@ def update_light(obj: bpy.types.Object, light: NDArray) -> None:
         if is_gloss(node.node_tree):
             light_gloss(obj.data, record, node, seen, turn)
         else:
-            set_light(node, seen)
+            set_light(node, seen, tint)
 
 
 def turn_since(obj: bpy.types.Object, record: BakeRecord) -> NDArray:

@@ -112,6 +112,21 @@ def test_relight_blend_doubles_with_the_strength(baked_blend, run, exr, tmp_path
     assert (baked_blend / "out.blend").read_bytes() == before and _names(tmp_path) == ["lit.exr"]
 
 
+def test_relight_is_lit_whatever_view_the_file_was_saved_in(baked_blend, run, exr, tmp_path):
+    import neural_gash_addon
+    neural_gash_addon.register()
+    try:
+        bpy.ops.wm.open_mainfile(filepath=str(baked_blend / "out.blend"), load_ui=False)
+        bpy.context.scene.neural_gash.view = "OCCLUSION"
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "view.blend"), copy=True)
+    finally:
+        neural_gash_addon.unregister()
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+    done = run("relight", tmp_path / "view.blend", "--png", tmp_path / "lit.exr")
+    assert done.returncode == 0 and not done.stderr
+    np.testing.assert_allclose(exr(tmp_path / "lit.exr"), exr(baked_blend / "out.exr"), rtol=1e-2, atol=1e-3)
+
+
 def test_out_holds_the_bake_and_the_rest(baked_blend):
     from neural_gash_addon.scene.attributes import has_bake, read_transfer
     bpy.ops.wm.open_mainfile(filepath=str(baked_blend / "out.blend"), load_ui=False)

@@ -123,7 +123,7 @@ def operator():
     """The logic of the operator outside Blender's, with its reports."""
     from neural_gash_addon.ops.bake import Baking
     from neural_gash_addon.ops.compare import NEURAL_GASH_OT_compare as Compare
-    members = {name: vars(Compare)[name] for name in ("_prepare", "_finish")}
+    members = {name: vars(Compare)[name] for name in ("_doing", "_prepare", "_finish")}
     made = type("Operator", (Baking,), {**members, "filepath": "",
                                         "report": lambda self, kind, text: self.reports.append((*kind, text))})()
     made.reports = []
@@ -149,6 +149,7 @@ def test_esc_and_changes_meanwhile_leave_everything(make, settings, operator, sn
     before = snapshot()
     context = Context()
     operator.invoke(context, None)
+    assert context.status == "Neural GASh: comparing methods on Ring, 0 %. Esc cancels"
     assert operator.modal(context, TIMER) == {"RUNNING_MODAL"}
     assert operator.modal(context, ESC) == {"CANCELLED"}
     operator._worker.join(60)

@@ -30,7 +30,7 @@ def _constants(obj):
     """Light constants (K, 3) of the preview's node group."""
     from neural_gash_addon.scene.preview import _group_nodes
     node = _group_nodes(obj)[0]
-    return np.array([node.inputs[f"L{k}"].default_value[:3] for k in range(len(node.inputs) - 1)])
+    return np.array([node.inputs[f"L{k}"].default_value[:3] for k in range(len(node.inputs) - 2)])
 
 
 def test_round_trip_gives_the_materials_back(make, settings):

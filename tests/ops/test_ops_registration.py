@@ -33,20 +33,27 @@ def test_twice_leaves_nothing(addon):
     addon.register()
 
 
-def test_every_setting_and_operator_is_described(addon):
-    properties = bpy.context.scene.neural_gash.bl_rna.properties
-    for prop in properties:
+def _check_described(rna):
+    """Every property of a type, and every item of its menus, says what it does."""
+    for prop in rna.properties:
         if prop.identifier in ("rna_type", "name"):
             continue
-        assert len(prop.description) > 15 and not prop.description.endswith("."), prop.identifier
+        where = f"{rna.identifier}.{prop.identifier}"
+        assert len(prop.description) > 15 and not prop.description.endswith("."), where
         for item in getattr(prop, "enum_items", ()):
-            assert item.description and not item.description.endswith("."), item.identifier
-    names = [name for name in dir(bpy.ops.neural_gash) if not name.startswith("_")]
-    assert {"bake", "bake_applied_copy", "clear", "read_light", "preview"} <= set(names)
+            assert item.description and not item.description.endswith("."), f"{where}: {item.identifier}"
+
+
+def test_everything_with_a_hover_text_has_one(addon):
+    from neural_gash_addon import ops
+    _check_described(bpy.context.scene.neural_gash.bl_rna)
+    names = {name for name in dir(bpy.ops.neural_gash) if not name.startswith("_")}
+    assert names == {cls.bl_idname.partition(".")[2] for cls in ops.CLASSES}
     for name in names:
         kind = getattr(bpy.ops.neural_gash, name).get_rna_type()
-        assert len(kind.description) > 15, name
+        assert len(kind.description) > 15 and not kind.description.endswith("."), name
         assert "UNDO" in getattr(bpy.types, f"NEURAL_GASH_OT_{name}").bl_options
+        _check_described(kind)
 
 
 def test_the_menu_is_the_table(settings):
@@ -100,7 +107,8 @@ def _draw(name):
 def test_panels_draw_in_every_state(make, settings, monkeypatch):
     from neural_gash_addon.ops import state
     bpy.context.view_layer.objects.active = None
-    assert "neural_gash.bake" in _draw("main")
+    assert _draw("main")[:4] == ["neural_gash.bake"] + 3 * ["neural_gash.preset"]
+    assert "view" in _draw("view")
     obj = make()
     assert "neural_gash.bake_applied_copy" not in _draw("main")
     bpy.ops.neural_gash.bake()
@@ -110,9 +118,16 @@ def test_panels_draw_in_every_state(make, settings, monkeypatch):
     obj.data.update()
     bpy.context.view_layer.update()
     assert "Changed since the bake" in _draw("main")
+    whole = obj.data["neural_gash"]
     obj.data["neural_gash"] = "{"
     assert any("bake again" in text for text in _draw("main"))
     assert {"light_rotation", "light_strength"} <= set(_draw("light"))
+    obj.data["neural_gash"] = whole
+    assert {"view", "neural_gash.show_errors"} <= set(_draw("view")) and "coefficient" not in _draw("view")
+    settings.view, settings.coefficient = "COEFFICIENT", 5
+    assert {"coefficient", "l = 2, m = -1"} <= set(_draw("view"))
+    settings.coefficient = 9
+    assert "The bake has coefficients 0 to 8" in _draw("view")
     for occluders in ("SELF", "COLLECTION"):
         settings.occluders = occluders
         assert ("collection" in _draw("settings")) == (occluders == "COLLECTION")

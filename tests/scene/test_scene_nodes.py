@@ -84,7 +84,7 @@ def test_group_is_small_and_shared(make):
     assert kinds.count("ATTRIBUTE") == 7
     assert kinds.count("VECT_MATH") == 25 + 1
     assert [i.name for i in group.interface.items_tree if i.in_out == "INPUT"] == \
-        ["Albedo"] + [f"L{k}" for k in range(25)]
+        ["Albedo", "Tint"] + [f"L{k}" for k in range(25)]
 
 
 def test_a_group_of_another_version_is_left_alone(make):
