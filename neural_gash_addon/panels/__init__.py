@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from functools import lru_cache
 
 import bpy
@@ -21,6 +22,8 @@ from ..scene.lighting import HDRI, SKY, problem
 from ..scene.preview import is_on
 from ..scene.views import COEFFICIENT, shows_errors
 
+_LETTER, _BESIDE = 6, 60  # pixels of a letter, on average, and of what is beside a line of text, at scale 1
+
 
 @lru_cache(maxsize=64)
 def _record(text: str) -> BakeRecord | str:
@@ -29,6 +32,15 @@ def _record(text: str) -> BakeRecord | str:
         return BakeRecord.from_json(text)
     except UserError as error:
         return str(error)
+
+
+def _paragraph(column: bpy.types.UILayout, text: str, icon: str = "NONE") -> None:
+    """A text in as many lines as the sidebar is wide for; a label alone would lose its middle."""
+    region, scale = bpy.context.region, bpy.context.preferences.system.ui_scale
+    width = int(region.width / scale - _BESIDE) // _LETTER if region else 0
+    for line in textwrap.wrap(text, max(width, 24)):
+        column.label(text=line, icon=icon)
+        icon = "NONE" if icon == "NONE" else "BLANK1"
 
 
 class _Panel:
@@ -71,7 +83,7 @@ class NEURAL_GASH_PT_main(_Panel, bpy.types.Panel):
         """The last bake in a few lines."""
         record = _record(obj.data[RECORD])
         if isinstance(record, str):
-            box.label(text=record, icon="ERROR")
+            _paragraph(box.column(align=True), record, "ERROR")
             return
         stale = staleness.status(obj) == staleness.STALE
         box.alert = stale
@@ -79,9 +91,7 @@ class NEURAL_GASH_PT_main(_Panel, bpy.types.Panel):
         label = METHODS[record.method].label if record.method in METHODS else record.method
         column = box.column(align=True)
         column.label(text=f"{label}, order {record.order}, {record.points:,} points")
-        for sentence in record.plan.split(": "):
-            if sentence:
-                column.label(text=sentence)
+        _paragraph(column, record.plan)
         if record.side:
             column.label(text=f"Texture: {record.side} x {record.side}, UV map {record.uv_map}")
         if record.bounces:
@@ -113,7 +123,7 @@ class NEURAL_GASH_PT_light(_Panel, bpy.types.Panel):
         else:
             layout.operator("neural_gash.read_light", icon="FILE_REFRESH")
         if problem(context.scene):
-            layout.label(text=problem(context.scene), icon="ERROR")
+            _paragraph(layout.column(align=True), problem(context.scene), "ERROR")
         layout.prop(settings, "light_rotation")
         layout.prop(settings, "light_strength")
         layout.prop(settings, "soften")
