@@ -68,6 +68,7 @@ class Job:
     bake: Callable[..., Generator[float, None, Transfer | TextureTransfer]]  # a texture's takes uv= and side=
     occluders: str
     fingerprint: str
+    key: str               # the fingerprint, and all else that tells it from other bakes
     frame: tuple[float, ...]
     texture: TextureOptions | None  # None: to vertices
     bounces: bool          # light was to bounce, so the albedo counts
@@ -108,13 +109,15 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
         what = {"method": settings.method, "order": settings.order, "occluders": occluders, "normal_maps": maps}
         texture = _texture_options(obj, settings, read.surface, tiles, what)
         before = fingerprint(obj, depsgraph, mode, texture.part.uv, reflection is not None)
-        bake = partial(bake_texture, read.surface, **what, **quality, folder=tiles, reflection=reflection,
-                       key=_key(settings, before, read.matrix, maps))
+        key = _key(settings, before, read.matrix, maps)
+        bake = partial(bake_texture, read.surface, **what, **quality, folder=tiles, reflection=reflection, key=key)
     else:
         before = fingerprint(obj, depsgraph, mode, bounces=reflection is not None)
+        key = _key(settings, before, read.matrix, ())
         bake = partial(methods.bake, read.mesh, settings.method, settings.order, **quality, occluders=occluders,
                        reflection=reflection)
-    return Job(obj.session_uid, obj.name, read, bake, mode, before, read.frame, texture, reflection is not None)
+    return Job(obj.session_uid, obj.name, read, bake, mode, before, key, read.frame, texture,
+               reflection is not None)
 
 
 def occluder_mode(obj: bpy.types.Object, settings: NeuralGashSettings, group: Sequence[bpy.types.Object]) -> str:
@@ -158,7 +161,7 @@ def size(settings: NeuralGashSettings) -> dict:
 
 
 def _key(settings: NeuralGashSettings, shape: str, matrix: NDArray, maps: Sequence[NormalMap]) -> str:
-    """What tells a texture bake from any other, in one text."""
+    """What tells a bake from any other, in one text."""
     digest = hashlib.blake2b(np.round(matrix, 6).tobytes(), digest_size=16)
     for normal_map in maps:
         digest.update(normal_map.image.tobytes() + normal_map.uv.tobytes()

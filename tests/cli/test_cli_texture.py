@@ -128,6 +128,6 @@ def test_sizes_folders_and_strengths_that_cannot_be_are_said(run, refused, blend
 def test_tiles_of_names_that_differ_only_in_signs_are_kept_apart(tmp_path):
     from types import SimpleNamespace
 
-    from neural_gash_addon.cli import _tiles
+    from neural_gash_addon.cli_bake import _tiles
     arguments = SimpleNamespace(textures=None, out=tmp_path / "a.blend", npz=None, png=None, texture=64)
     assert len({_tiles(arguments, SimpleNamespace(name=name)) for name in ("a b", "a_b", "a/b")}) == 3
