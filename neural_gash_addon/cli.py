@@ -73,9 +73,9 @@ def _parser() -> argparse.ArgumentParser:
                       help="bake a copy with its modifiers applied, where those change the vertices")
     bake.add_argument("--json", action="store_true", help="print the record as one line of JSON, one for each object")
     many = bake.add_argument_group(
-        "many bakes", "Several INPUTs, --frames or --shard bake each object of each file at each frame by itself: one "
-        "line of JSON for each, and nothing for what is up to date. {file}, {object} and {frame} in the names of "
-        "outputs stand for those of each.")
+        "many bakes", "Several INPUTs, --frames or --shard bake each object of each file at each frame by itself, "
+        "but those that are up to date, and print a line of JSON for each. {file}, {object} and {frame} in the names "
+        "of outputs stand for those of each.")
     many.add_argument("--frames", type=farm.frame_list, metavar="FRAMES", help="such as 1-10 or 1-10,20: bake the mesh "
                       "as it is then")
     many.add_argument("--shard", type=farm.shard, metavar="I/N", help="only every Nth bake, from the Ith on")
