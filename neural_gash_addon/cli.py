@@ -6,7 +6,7 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -137,7 +137,7 @@ def _farm(arguments: argparse.Namespace) -> int:
     check_bake(arguments)
     check_suffixes(arguments)
     code = OK
-    entries = farm.bake_all(arguments)
+    entries = farm.bake_all(arguments, _progress_bar())
     while True:
         with silent_blender():
             entry = next(entries, None)
@@ -145,7 +145,8 @@ def _farm(arguments: argparse.Namespace) -> int:
             return code
         if "error" in entry:
             code = BAD_INPUT
-            print(f"neural_gash: {entry['file']}: {entry['error']}", file=sys.stderr)
+        for word in entry.keys() & {"error", "warning"}:
+            print(f"neural_gash: {entry['file']}: {entry[word]}", file=sys.stderr)
         print(json.dumps(entry, sort_keys=True), flush=True)
 
 
@@ -155,7 +156,10 @@ def _bake(arguments: argparse.Namespace) -> tuple[list[dict], str]:
     if arguments.npz is not None and len(arguments.objects or ()) > 1:
         raise UserError("--npz holds the points of one object; bake several one by one.")
     open_file(arguments.inputs[0])
-    outcomes = finish_bake(arguments, *prepare_bake(arguments, choose_meshes(arguments.objects)))
+    outcomes = finish_bake(arguments, *prepare_bake(arguments, choose_meshes(arguments.objects)), _progress_bar())
+    for outcome in outcomes:
+        if outcome.record is not None and outcome.sentence:
+            print(f"neural_gash: {outcome.sentence}", file=sys.stderr)
     return ([{"object": o.name, "error": o.sentence} if o.record is None else {"object": o.name, **asdict(o.record)}
              for o in outcomes],
             "\n".join(f"{o.name}: {summary(o.record)}." for o in outcomes if o.record is not None))
@@ -222,6 +226,18 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
 _COMMANDS = {"bake": _bake, "relight": _relight}
 
 
+
+
+def _progress_bar() -> Callable[[float], None] | None:
+    """A bar on a terminal; None elsewhere."""
+    if not sys.stderr.isatty():
+        return None
+
+    def show(share: float) -> None:
+        end = "\n" if share >= 1 else ""
+        print(f"\rbaking [{'#' * round(40 * share):<40}] {100 * share:3.0f} %", end=end, file=sys.stderr, flush=True)
+
+    return show
 
 
 _command = None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -85,17 +84,19 @@ def prepare_bake(arguments: argparse.Namespace, objects: list[bpy.types.Object],
     return objects, prepare_batch(bpy.context, objects, settings, partial(_tiles, arguments))
 
 
-def finish_bake(arguments: argparse.Namespace, objects: Sequence[bpy.types.Object], batch: Batch) -> list[Outcome]:
+def finish_bake(arguments: argparse.Namespace, objects: Sequence[bpy.types.Object], batch: Batch,
+                progress: Callable[[float], None] | None) -> list[Outcome]:
     """Bake what `prepare_bake` gave, and write --npz, --png and --out.
 
+    Args:
+        progress: called with the share done (0 to 1).
+    Returns:
+        Of each object: its record, and what to warn of.
     Raises:
         UserError, OSError: nothing could be baked, or the outcome not be kept.
     """
-    results = methods.run(batch.baking, _progress_bar())
+    results = methods.run(batch.baking, progress)
     outcomes = finish_batch(bpy.context, batch, results)
-    for outcome in outcomes:
-        if outcome.record is not None and outcome.sentence:
-            print(f"neural_gash: {outcome.sentence}", file=sys.stderr)
     if arguments.npz:
         (job,), (transfer,), (outcome,) = batch.jobs, results, outcomes
         assert isinstance(transfer, Transfer) and outcome.record is not None
@@ -123,15 +124,3 @@ def clean_name(name: str) -> str:
     if clean != name:  # others' names may be the same but for what was replaced
         clean += "-" + hashlib.blake2b(name.encode(), digest_size=4).hexdigest()
     return clean
-
-
-def _progress_bar() -> Callable[[float], None] | None:
-    """A bar on a terminal; None elsewhere."""
-    if not sys.stderr.isatty():
-        return None
-
-    def show(share: float) -> None:
-        end = "\n" if share >= 1 else ""
-        print(f"\rbaking [{'#' * round(40 * share):<40}] {100 * share:3.0f} %", end=end, file=sys.stderr, flush=True)
-
-    return show

@@ -11,7 +11,7 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,9 +68,11 @@ def is_wanted(arguments: argparse.Namespace) -> bool:
     return len(arguments.inputs) > 1 or arguments.frames is not None or arguments.shard is not None
 
 
-def bake_all(arguments: argparse.Namespace) -> Iterator[dict]:
-    """Bake this shard's items; of each as it ends: file, object, frame, status, seconds, record or error.
+def bake_all(arguments: argparse.Namespace, progress: Callable[[float], None] | None) -> Iterator[dict]:
+    """Bake this shard's items; of each as it ends: file, object, frame, status, seconds, record or error, warning.
 
+    Args:
+        progress: called with the share of an item that is done (0 to 1).
     Raises:
         UserError: before the first, where no item could be kept.
     """
@@ -90,7 +92,7 @@ def bake_all(arguments: argparse.Namespace) -> Iterator[dict]:
                 opened = None
                 open_file(item.file)
             opened = None  # where this fails halfway, the next opens it anew
-            found, changed = _bake(arguments, item, entry)
+            found, changed = _bake(arguments, item, entry, progress)
             opened = None if changed else item.file
         except (UserError, OSError) as error:
             found = {"status": "failed", "error": sentence(error)}
@@ -143,7 +145,8 @@ def _of(arguments: argparse.Namespace, item: Item, name: str | None = None) -> a
     return argparse.Namespace(**{**vars(arguments), **{key: named(getattr(arguments, key)) for key in _OUTPUTS}})
 
 
-def _bake(arguments: argparse.Namespace, item: Item, entry: dict) -> tuple[dict, bool]:
+def _bake(arguments: argparse.Namespace, item: Item, entry: dict, progress: Callable[[float], None] | None,
+          ) -> tuple[dict, bool]:
     """Bake an item of the open file unless it is up to date: what to tell, and whether the file must be opened anew.
 
     Raises:
@@ -170,14 +173,15 @@ def _bake(arguments: argparse.Namespace, item: Item, entry: dict) -> tuple[dict,
     if known is not None and _same(known["key"], key) and all(Path(path).exists() for path in _kept(own, known)):
         return {"status": "up to date", "record": known["record"]}, own.applied_copy
     state.unlink(missing_ok=True)  # were this killed now, nothing may call the old state that of the new files
-    outcome, = finish_bake(own, objects, batch)
+    outcome, = finish_bake(own, objects, batch, progress)
     assert outcome.record is not None
     record = json.loads(outcome.record.to_json())
     textures = [] if own.textures is None else sorted(path.name for path in own.textures.glob("*.exr"))
     with exchange.atomic(state) as draft:
         draft.write_text(json.dumps({"key": key, "record": record, "textures": textures}, sort_keys=True) + "\n",
                          encoding="utf-8")
-    return {"status": "baked", "record": record}, changes
+    warning = {"warning": outcome.sentence} if outcome.sentence else {}
+    return {"status": "baked", "record": record, **warning}, changes
 
 
 def _kept(own: argparse.Namespace, known: dict) -> list[Path]:

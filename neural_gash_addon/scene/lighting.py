@@ -170,7 +170,7 @@ def show_gloss(scene: bpy.types.Scene) -> None:
 
 @persistent
 def _on_load(*_: object) -> None:
-    """The images of glossy previews are not saved: fill them again."""
+    """Another file: forget the one before. The images of glossy previews are not saved: fill them again."""
     _problems.clear()
     forget_image()
     for scene in bpy.data.scenes:

@@ -66,7 +66,8 @@ def file_light(path: Path, order: int) -> Array:
     try:
         image = bpy.data.images.load(str(path.absolute()))
     except RuntimeError as error:
-        raise UserError(f"The HDRI '{path}' cannot be read: {str(error).strip().removeprefix('Error: ')}") from error
+        reason = str(error).strip().removeprefix("Error: ").rstrip(".")
+        raise UserError(f"The HDRI '{path}' cannot be read: {reason}.") from error
     try:
         return sh_light.project_equirect(linear_pixels(image), order)
     finally:

@@ -100,6 +100,12 @@ def test_suns_are_followed(lit):
     assert np.abs(_followed(obj)).max() == 0
     lamp.hide_render = False
     np.testing.assert_allclose(_followed(obj), shining, atol=1e-6)
+    holder = bpy.data.objects.new("Crane", bpy.data.meshes.new("Crane"))
+    bpy.context.scene.collection.objects.link(holder)
+    lamp.parent = holder
+    bpy.context.view_layer.update()
+    holder.rotation_euler = (0, 1, 0)
+    _followed(obj)
     bpy.data.objects.remove(lamp)
     assert np.abs(_followed(obj)).max() == 0
 
