@@ -23,6 +23,9 @@ from .workers import product, results
 SETS = 16
 MAX_RAYS = 4096
 RAYS_PER_JOB = 1 << 16  # about 15 ms of one thread: short enough to stop at once, long enough to be efficient
+# Directions up to which a job mixes points of all sets: with more, one matrix product for all points of a set is
+# quicker, with fewer, going from set to set is.
+_MIXED = 16
 
 _TURNED_AT_ONCE = 2048  # points rotated by one worker at a time
 
@@ -77,12 +80,17 @@ class BlockedEstimator:
         return sums
 
     def _jobs(self, points: NDArray, start: int, stop: int) -> Iterator[tuple[NDArray, tuple[NDArray, NDArray]]]:
-        """Rows of `points` that share a set, with its tables for directions start..stop."""
+        """Rows of `points`, and what `_blocked_sums` wants of directions start..stop: of their set, or of all sets."""
         size = max(1, RAYS_PER_JOB // (stop - start))
         set_of_row = self._set_of_point[points]
+        harmonics = self._harmonics(start, stop)
+        if stop - start <= _MIXED:
+            every = self._sets[:, start:stop].astype(np.float32)
+            for part in np.array_split(np.arange(len(points)), -(-len(points) // size)):
+                yield part, (every, harmonics)
+            return
         rows_by_set = np.argsort(set_of_row, kind="stable")
         bounds = np.searchsorted(set_of_row[rows_by_set], np.arange(len(self._sets) + 1))
-        harmonics = self._harmonics(start, stop)
         for s in range(len(self._sets)):
             rows = rows_by_set[bounds[s]:bounds[s + 1]]
             if not len(rows):
@@ -99,15 +107,22 @@ class BlockedEstimator:
         local = self._sets[:, start:stop]
         return sh.evaluate(local.reshape(-1, 3), self._order).reshape(*local.shape[:2], -1)
 
-    def _blocked_sums(self, points: NDArray, lift: NDArray, harmonics: NDArray) -> NDArray[np.float64]:
-        """Worker: (n, K) sums of Y_k over the blocked ones of these directions at these points."""
-        frames = self._frames(points).reshape(-1, 9).astype(np.float32)
-        count = len(harmonics)
-        directions = product(frames, lift).reshape(-1, 3)
+    def _blocked_sums(self, points: NDArray, directions: NDArray, harmonics: NDArray) -> NDArray[np.float64]:
+        """Worker: (n, K) sums of Y_k over the blocked ones of some directions at some points.
+
+        directions: of one set, as `_jobs` lifts them, with harmonics (r, K); or (sets, r, 3) with (sets, r, K).
+        """
+        frames = self._frames(points).astype(np.float32)
+        count = harmonics.shape[-2]
+        if mixed := harmonics.ndim == 3:
+            here = self._set_of_point[points]
+            world = (directions[here] @ frames.transpose(0, 2, 1)).reshape(-1, 3)
+        else:
+            world = product(frames.reshape(-1, 9), directions).reshape(-1, 3)
         origins = np.repeat(self._origins[points], count, axis=0)
-        free = self._occluders.blocked(origins, directions)  # 0 blocked, -1 free
+        free = self._occluders.blocked(origins, world)  # 0 blocked, -1 free
         blocked = np.add(free, 1, dtype=np.float64).reshape(-1, count)
-        return product(blocked, harmonics)
+        return np.einsum("nr,nrk->nk", blocked, harmonics[here]) if mixed else product(blocked, harmonics)
 
     def means(self, points: NDArray, sums: NDArray, start: int, stop: int) -> NDArray[np.float64]:
         """Blocked part (n, K) in the local frame, from sums over directions start..stop.

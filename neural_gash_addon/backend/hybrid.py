@@ -34,7 +34,7 @@ FULL = 0.5 / np.pi ** 0.5  # coefficient 0 of a point of which all is blocked
 LEAST, MOST = -6.0, 12.0  # of the logarithms that the network gives
 HALF = 64.0               # rays at which s is twice what it is with none
 TINY = 1e-6               # of a variance: below the noise of any number of rays
-_BLOCKS = 16, 128         # at a time, at least and at most: less is all overhead, more overflows the cache
+_BLOCKS = 64, 128         # at a time, at least and at most: less is all overhead, more overflows the cache
 _TURN = np.array([[0.8, -0.48, 0.36], [0.6, 0.64, -0.48], [0.0, 0.6, 0.8]])  # of the second curve
 
 
@@ -129,7 +129,7 @@ def filtered(places: NDArray, normals: NDArray, orders: Sequence[NDArray], block
 def blocks(order: NDArray) -> list[tuple[NDArray, int]]:
     """Runs of an order (N,) with the size of the blocks in each: of SIZE, and what is left over at its end."""
     whole = len(order) - len(order) % SIZE
-    step = SIZE * int(np.clip(len(order) // (4 * SIZE) + 1, *_BLOCKS))  # small meshes give work to all threads, too
+    step = SIZE * int(np.clip(len(order) // (4 * SIZE) + 1, *_BLOCKS))  # work for all threads, where it is enough
     runs = [(order[start:min(start + step, whole)], SIZE) for start in range(0, whole, step)]
     return runs + ([(order[whole:], len(order) - whole)] if whole < len(order) else [])
 

@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 
 MAX_ORDER = 5
 _BLOCK = 2048  # functions rotated at a time: their rows stay in the second-level cache
+_THIRD = 3 ** -0.5  # of 3 z^2 - 1 beside x^2 - y^2, in band 2
 
 
 def coefficient_count(order: int) -> int:
@@ -151,22 +152,59 @@ def rotate_each(coefficients: NDArray, rotations: NDArray) -> Array:
     """
     c = np.asarray(coefficients, dtype=np.float64)
     order = order_of(c.shape[1])
-    directions, inverses = _sample_directions(order)
     out = np.empty_like(c)
     for start in range(0, len(c), _BLOCK):
         part = slice(start, start + _BLOCK)
         matrices = np.ascontiguousarray(rotations[part].reshape(-1, 9).T, dtype=np.float64)  # (9, B)
         rows = np.ascontiguousarray(c[part].T)
-        lobes = [inverses[b] @ rows[band_slice(b)] for b in range(order)]
         total = np.zeros_like(rows)
-        for j, (dx, dy, dz) in enumerate(directions):
-            turned = [matrices[3 * i] * dx + matrices[3 * i + 1] * dy + matrices[3 * i + 2] * dz for i in range(3)]
-            values = _evaluate_rows(turned, order)
-            for band in range((j + 1) // 2, order):  # lobe j takes part where 2l+1 > j
-                s = band_slice(band)
-                total[s] += values[s] * lobes[band][j]
+        total[0] = rows[0]
+        if order > 1:
+            _turn_vector(matrices, rows[1:4], total[1:4])
+        if order > 2:
+            _turn_tensor(matrices, rows[4:9], total[4:9])
+        if order > 3:
+            _turn_lobes(matrices, rows, total, order)
         out[part] = total.T
     return out
+
+
+def _turn_vector(matrices: Array, rows: Array, out: Array) -> None:
+    """Band 1 (3, B), which is a vector (y, z, x), turned by matrices (9, B)."""
+    y, z, x = rows
+    for row, axis in enumerate((1, 2, 0)):
+        first, second, third = matrices[3 * axis:3 * axis + 3]
+        np.multiply(first, x, out=out[row])
+        out[row] += second * y
+        out[row] += third * z
+
+
+def _turn_tensor(matrices: Array, rows: Array, out: Array) -> None:
+    """Band 2 (5, B) turned by matrices R (9, B): a symmetric tensor M without trace becomes R M R^T."""
+    xy, yz, mean, xz, apart = rows
+    mean = mean * _THIRD
+    half = ((apart - mean, xy, xz), (xy, -apart - mean, yz), (xz, yz, 2 * mean))  # M
+    turned = [[matrices[3 * i] * half[0][k] + matrices[3 * i + 1] * half[1][k] + matrices[3 * i + 2] * half[2][k]
+               for k in range(3)] for i in range(3)]  # R M
+
+    def entry(i: int, j: int) -> Array:
+        return turned[i][0] * matrices[3 * j] + turned[i][1] * matrices[3 * j + 1] + turned[i][2] * matrices[3 * j + 2]
+
+    out[0], out[1], out[3] = entry(0, 1), entry(1, 2), entry(0, 2)
+    np.multiply(entry(2, 2), 0.5 / _THIRD, out=out[2])
+    np.multiply(entry(0, 0) - entry(1, 1), 0.5, out=out[4])
+
+
+def _turn_lobes(matrices: Array, rows: Array, out: Array, order: int) -> None:
+    """Bands from 3 on, as `rotate` does it, added to `out`."""
+    directions, inverses = _sample_directions(order)
+    lobes = {band: inverses[band] @ rows[band_slice(band)] for band in range(3, order)}
+    for j, (dx, dy, dz) in enumerate(directions):
+        turned = [matrices[3 * i] * dx + matrices[3 * i + 1] * dy + matrices[3 * i + 2] * dz for i in range(3)]
+        values = _evaluate_rows(turned, order)
+        for band in range(max(3, (j + 1) // 2), order):  # lobe j takes part where 2l+1 > j
+            s = band_slice(band)
+            out[s] += values[s] * lobes[band][j]
 
 
 def cosine_lobe_bands(order: int) -> Array:
