@@ -14,7 +14,7 @@ from . import spherical_harmonics as sh
 from .estimator import MAX_RAYS, BlockedEstimator
 from .geometry import TriangleMesh
 from .hybrid import Network, curves, filtered, placed
-from .progress import scaled
+from .progress import run, scaled
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
 from .transfer import Transfer
@@ -65,6 +65,21 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
         method="hybrid", order=order, points=len(mesh.points), domain=mesh.domain, seed=seed, rays=used * len(lit),
         probe_rays=work.probes, seconds=time.perf_counter() - began, error_estimate=error if len(lit) else 0.0,
         tolerance=tolerance))
+
+
+def at_once(mesh: TriangleMesh, occluders: Sequence[Geometry], order: int, rays: int, seed: int) -> NDArray[np.float32]:
+    """Transfer (N, K) as the network has it, for frames that come one after another: nothing is measured, so the
+    network is followed wholly. That is right where rays are few.
+    """
+    scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
+    lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+    unshadowed = sh.cosine_lobe(mesh.normals, order).astype(np.float32)
+    if not len(lit):
+        return unshadowed
+    threads = default_threads()
+    with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+        work = _Work(mesh, scene, order, seed, rays, lit, pool, threads, load_hybrid(), unshadowed)
+        return unshadowed - run(work.trace(0, rays))[1]
 
 
 class _Work:

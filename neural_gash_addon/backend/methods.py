@@ -15,7 +15,8 @@ from .bounce import Reflection
 from .errors import UserError
 from .estimator import MAX_RAYS
 from .geometry import TriangleMesh
-from .progress import Result, scaled
+from .progress import run as run  # the callers of `bake` drive it
+from .progress import scaled
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
 from .transfer import Transfer
@@ -132,16 +133,3 @@ def _with_bounces(direct: Baking, mesh: TriangleMesh, occluders: Sequence[Geomet
     """A bake of direct transfer, and then what bounces add to it."""
     transfer = yield from scaled(direct, 0, 0.6)
     return (yield from scaled(reflection.add(transfer, mesh, occluders, scene, threads), 0.6, 0.4))
-
-
-def run(baking: Generator[float, None, Result], progress: Callable[[float], None] | None = None) -> Result:
-    """Drive a bake to its end, calling `progress` with the share done (0 to 1)."""
-    try:
-        while True:
-            share = next(baking)
-            if progress:
-                progress(share)
-    except StopIteration as end:
-        return end.value
-    finally:
-        baking.close()

@@ -18,6 +18,16 @@ from .albedo import Finish, Images, triangle_finish
 from .attributes import RECORD, discard
 from .evaluation import evaluated, revealed, shown_objects
 from .frames import Array, as_array, bake_frame, rotation_part
+from .mesh_arrays import (
+    check_coordinates,
+    check_matrix,
+    check_topology,
+    outward,
+    read_corner_vertices,
+    read_positions,
+    read_triangle_corners,
+    to_world,
+)
 from .normal_maps import normal_map_key
 from .preview import preview_off
 from .uv_maps import mark_own_uv, own_uv_name
@@ -26,7 +36,6 @@ SELF, VISIBLE = "SELF", "VISIBLE"
 # Stretch and places are compared to this part of their size: far above float32 noise of a turned
 # matrix, far below what changes a shadow.
 _SAME = 1e-4
-_FARTHEST = 1e18  # metres; beyond, squares of coordinates leave float32
 
 __all__ = ["SELF", "VISIBLE", "SceneMesh", "bake_frame", "fingerprint", "group_mode", "is_group", "make_applied_copy",
            "read_object", "read_occluders", "refusal", "same_fingerprint"]
@@ -81,14 +90,14 @@ def read_object(obj: bpy.types.Object | None, depsgraph: bpy.types.Depsgraph) ->
         raise UserError(reason)
     with evaluated(obj, depsgraph) as copy:
         matrix = as_array(copy.matrix_world)
-        _check_matrix(obj.name, matrix)
+        check_matrix(obj.name, matrix)
         mesh = copy.to_mesh()
         try:
-            _check_topology(obj, mesh)
-            local = _positions(mesh)
-            _check_coordinates(obj.name, local, matrix)
-            corner_vertices = _corner_vertices(mesh)
-            corners = _triangle_corners(mesh)
+            check_topology(obj, mesh)
+            local = read_positions(mesh)
+            check_coordinates(obj.name, local, matrix)
+            corner_vertices = read_corner_vertices(mesh)
+            corners = read_triangle_corners(mesh)
             normals = np.empty((len(corner_vertices), 3), np.float32)
             mesh.corner_normals.foreach_get("vector", normals.ravel())
             sizes = np.empty(len(mesh.polygons), np.int32)
@@ -103,8 +112,8 @@ def read_object(obj: bpy.types.Object | None, depsgraph: bpy.types.Depsgraph) ->
     spacing = float(np.spacing(np.abs(local).max())) * float(np.linalg.norm(linear, 2))
     corner_faces = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)
     normals = normals @ np.linalg.inv(linear).astype(np.float32)  # inverse transpose: outward in mirrors, too
-    return SceneMesh(Surface(_transform(local, matrix), corner_vertices, unit(normals).astype(np.float32), corner_faces,
-                             _outward(corners, matrix), spacing), matrix)
+    return SceneMesh(Surface(to_world(local, matrix), corner_vertices, unit(normals).astype(np.float32), corner_faces,
+                             outward(corners, matrix), spacing), matrix)
 
 
 def make_applied_copy(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bpy.types.Object:
@@ -175,7 +184,7 @@ def read_occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgr
     Raises:
         UserError: there is no such collection or object.
     """
-    return [(_transform(local, matrix), _outward(triangles, matrix))
+    return [(to_world(local, matrix), outward(triangles, matrix))
             for local, triangles, _, matrix in _occluders(obj, mode, depsgraph)]
 
 
@@ -185,7 +194,7 @@ def read_finish(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph
     with evaluated(obj, depsgraph) as copy:
         mesh = copy.to_mesh()
         try:
-            own = triangle_finish(copy, mesh, _triangle_corners(mesh), known)
+            own = triangle_finish(copy, mesh, read_triangle_corners(mesh), known)
         finally:
             copy.to_mesh_clear()
     values: list[Array] = []
@@ -193,7 +202,7 @@ def read_finish(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph
     others = ((finish, matrix) for _, _, finish, matrix in _occluders(obj, mode, depsgraph, known))
     for (found, images), matrix in [(own, as_array(obj.matrix_world)), *others]:
         start = sum(map(len, values))
-        pictures += [replace(image, triangles=start + image.triangles, uv=_outward(image.uv, matrix))
+        pictures += [replace(image, triangles=start + image.triangles, uv=outward(image.uv, matrix))
                      for image in images]
         values.append(found)
     return np.concatenate(values), pictures
@@ -216,15 +225,15 @@ def fingerprint(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, occluder_
         raise UserError(reason)
     with evaluated(obj, depsgraph) as copy:
         matrix = as_array(copy.matrix_world)
-        _check_matrix(obj.name, matrix)
+        check_matrix(obj.name, matrix)
         mesh = copy.to_mesh()
         try:
-            _check_topology(obj, mesh)
+            check_topology(obj, mesh)
             digest = hashlib.blake2b(digest_size=16)
-            local = _positions(mesh)
-            _check_coordinates(obj.name, local, matrix)
+            local = read_positions(mesh)
+            check_coordinates(obj.name, local, matrix)
             digest.update(local.tobytes())
-            digest.update(_corner_vertices(mesh).tobytes())
+            digest.update(read_corner_vertices(mesh).tobytes())
             _hash_shading(mesh, digest)
             if uv is not None:
                 digest.update(uv.tobytes())
@@ -333,9 +342,9 @@ def _solid_arrays(solid: bpy.types.Object, images: Images | None
     try:
         if not len(mesh.polygons):
             return None
-        positions = _positions(mesh)
-        corners = _triangle_corners(mesh)
-        triangles = _corner_vertices(mesh)[corners]
+        positions = read_positions(mesh)
+        corners = read_triangle_corners(mesh)
+        triangles = read_corner_vertices(mesh)[corners]
         whole = np.isfinite(positions).all(axis=1)[triangles].all(axis=1)
         finish, pictures = ((np.zeros((len(whole), 7)), []) if images is None
                             else triangle_finish(solid, mesh, corners, images))
@@ -343,65 +352,6 @@ def _solid_arrays(solid: bpy.types.Object, images: Images | None
                 (finish[whole], [picture.only(whole) for picture in pictures]))
     finally:
         solid.to_mesh_clear()
-
-
-def _positions(mesh: bpy.types.Mesh) -> NDArray[np.float32]:
-    """(V, 3) local coordinates."""
-    out = np.empty((len(mesh.vertices), 3), np.float32)
-    mesh.attributes["position"].data.foreach_get("vector", out.ravel())
-    return out
-
-
-def _corner_vertices(mesh: bpy.types.Mesh) -> NDArray[np.int32]:
-    """(C,) vertex of each face corner; the attribute is 300 times faster than mesh.loops."""
-    out = np.empty(len(mesh.loops), np.int32)
-    if len(out):
-        mesh.attributes[".corner_vert"].data.foreach_get("value", out)
-    return out
-
-
-def _triangle_corners(mesh: bpy.types.Mesh) -> NDArray[np.int32]:
-    """(F, 3) face corners of each triangle."""
-    mesh.calc_loop_triangles()
-    corners = np.empty((len(mesh.loop_triangles), 3), np.int32)
-    mesh.loop_triangles.foreach_get("loops", corners.ravel())
-    return corners
-
-
-def _check_topology(obj: bpy.types.Object, mesh: bpy.types.Mesh) -> None:
-    """UserError unless the evaluated mesh has the elements of the object's own, in the same order."""
-    own = obj.data
-    same = (len(mesh.vertices) == len(own.vertices) and len(mesh.polygons) == len(own.polygons)
-            and np.array_equal(_corner_vertices(mesh), _corner_vertices(own)))
-    if not same:
-        raise UserError(f"The modifiers of '{obj.name}' change its vertices or faces, so a bake has no place "
-                        "on its mesh; bake an applied copy instead.")
-
-
-def _check_coordinates(name: str, local: NDArray[np.float32], matrix: Array) -> None:
-    """UserError for coordinates that nothing can be computed from."""
-    largest = float(np.abs(local).max(initial=0.0)) * float(np.linalg.norm(matrix[:3, :3], 2))
-    if not largest < _FARTHEST:  # also where it is not a number
-        raise UserError(f"'{name}' has coordinates that are infinite, too large or not numbers.")
-
-
-def _check_matrix(name: str, matrix: Array) -> None:
-    """UserError for a transform that leaves no shape."""
-    if not np.isfinite(matrix).all():
-        raise UserError(f"'{name}' has a location, rotation or scale that is infinite or not a number.")
-    sizes = np.linalg.svd(matrix[:3, :3], compute_uv=False)
-    if sizes[2] <= 1e-9 * sizes[0]:
-        raise UserError(f"'{name}' has a scale of zero, which leaves no shape to bake.")
-
-
-def _transform(local: NDArray[np.float32], matrix: Array) -> Array:
-    """Local points (V, 3) to world axes, in float64."""
-    return local.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-
-
-def _outward(triangles: NDArray, matrix: Array) -> NDArray:
-    """Triangles (F, 3, ...) wound as in local coordinates also where the matrix mirrors, which turns them round."""
-    return triangles[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else triangles
 
 
 def _hash_shading(mesh: bpy.types.Mesh, digest) -> None:
