@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import bpy
 from bpy.props import (
@@ -21,6 +22,7 @@ from .backend.estimator import MAX_RAYS
 from .backend.lobes import GGX, PHONG
 from .backend.methods import METHODS, MIN_ORDER, MIN_TOLERANCE
 from .backend.spherical_harmonics import MAX_ORDER
+from .scene import live
 from .scene.lighting import HDRI, SKY, SUNS, WORLD, apply_light, follow_light, show_gloss
 from .scene.read import SELF, VISIBLE
 from .scene.views import COEFFICIENT, LIT, OCCLUSION
@@ -57,6 +59,14 @@ def _view_changed(settings: NeuralGashSettings, _context: bpy.types.Context) -> 
         show_gloss(settings.id_data)
     else:
         apply_light(settings.id_data)
+
+
+def _live_changed(settings: NeuralGashSettings, _context: bpy.types.Context) -> None:
+    """Live was switched, or its budget changed."""
+    if settings.live:
+        live.start(settings.id_data)
+    else:
+        live.forget()
 
 
 class NeuralGashSettings(bpy.types.PropertyGroup):
@@ -161,10 +171,28 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
         name="Coefficient", default=0, min=0, max=MAX_ORDER ** 2 - 1, update=_view_changed,
         description="Which number of each point to show: l x (l + 1) + m of band l, counted from 0; 0 is the ambient "
                     "occlusion")
+    live: BoolProperty(  # type: ignore[valid-type]
+        name="Live", default=False, update=_live_changed,
+        description="Bakes to vertices follow their objects while these are posed or animated; frames that are "
+                    "rendered are baked as the settings have it")
+    live_budget: IntProperty(  # type: ignore[valid-type]
+        name="Milliseconds", default=33, min=1, max=10000, soft_min=10, soft_max=200, update=_live_changed,
+        description="Time that an update of a live bake may take, in milliseconds: 33 is 30 frames a second. More "
+                    "gives better shadows; what there is time for is measured when Live is switched on")
+    sequence_folder: StringProperty(  # type: ignore[valid-type]
+        name="Folder", default="", subtype="DIR_PATH", options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+        description="Where to write the bake of an animation, one file for each object; leave empty to write it beside "
+                    "the .blend file")
     soften: BoolProperty(  # type: ignore[valid-type]
         name="Reduce Ringing", default=False, update=_light_changed,
         description="Damp the dark and bright rings that a small bright light leaves at low orders; "
                     "this also softens the light a little")
+
+    def tracing(self) -> dict[str, Any]:
+        """What the method wants to know of how long to trace: `rays`, `tolerance`, or nothing."""
+        if not METHODS[self.method].traces:
+            return {}
+        return {"rays": self.rays} if self.quality == RAYS else {"tolerance": self.tolerance}
 
     def lobe_shown(self) -> str:
         """The lobe of glossy previews; '' where they are dull."""

@@ -24,6 +24,9 @@ from .raycast import Geometry
 
 COARSEST = 512         # vertices: fewer are no quicker, as what each call costs is more than they do
 _RAYS = (2, 4, 8, 16, 32, 64)
+# Errors below this are alike, and the plan that does most is taken: a mesh at rest may have no shadow at all, and then
+# says nothing of what the next pose needs.
+_ALIKE = 0.01
 _SAMPLE, _SAMPLE_RAYS = 512, 256  # points at which errors are measured
 
 
@@ -111,7 +114,9 @@ class Live:
             error = float(np.square(found[sample] - truth).sum() / energy) ** 0.5
             tried.append(replace(plan, seconds=took, error=error))
         within = [plan for plan in tried if plan.seconds <= seconds]
-        return min(within, key=lambda plan: plan.error) if within else min(tried, key=lambda plan: plan.seconds)
+        if not within:
+            return min(tried, key=lambda plan: plan.seconds)
+        return min(within, key=lambda plan: (max(plan.error, _ALIKE), -plan.seconds))
 
     def _plans(self) -> Iterator[LivePlan]:
         """Every plan, from the coarsest level."""

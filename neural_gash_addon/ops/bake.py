@@ -52,6 +52,7 @@ class Baking:
     """What the Bake operators share. They differ in what is baked."""
 
     _doing = "baking"  # what the status line says of it
+    _worker_type: type[Worker] = Worker
 
     if TYPE_CHECKING:  # the operator's own
         def report(self, type: set[str], message: str) -> None: ...
@@ -86,7 +87,7 @@ class Baking:
             batch = self._prepare(context, _tiles)
         except UserError as error:
             return self._fail(context, error)
-        self._batch, self._worker = batch, Worker(batch.baking)
+        self._batch, self._worker = batch, self._worker_type(batch.baking)
         self._timer = context.window_manager.event_timer_add(_TICK, window=context.window)
         context.window_manager.modal_handler_add(self)
         context.window_manager.progress_begin(0, 100)

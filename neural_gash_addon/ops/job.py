@@ -25,7 +25,7 @@ from ..backend.texels import NormalMap
 from ..backend.texture import TextureTransfer, remove_tiles
 from ..backend.texture import bake as bake_texture
 from ..backend.transfer import Transfer
-from ..properties import COLLECTION, DENSITY, FIT, RAYS, TEXTURE, NeuralGashSettings
+from ..properties import COLLECTION, DENSITY, FIT, TEXTURE, NeuralGashSettings
 from ..scene.attributes import attribute_count, read_record, write_textures, write_transfer
 from ..scene.lighting import apply_light, take_light
 from ..scene.normal_maps import read_normal_maps
@@ -90,10 +90,7 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
     read = read_object(obj, depsgraph)
     method = methods.METHODS[settings.method]
     mode = occluder_mode(obj, settings, group) if method.sees else SELF
-    quality = {}
-    if method.traces:
-        by_rays = settings.quality == RAYS
-        quality = {"rays": settings.rays} if by_rays else {"tolerance": settings.tolerance}
+    quality = settings.tracing()
     reflection = None
     if method.traces and settings.bounces:
         if settings.target != TEXTURE and attribute_count(3 * settings.order ** 2) > EEVEE_ATTRIBUTES:
@@ -185,6 +182,17 @@ def check(context: bpy.types.Context, job: Job) -> bpy.types.Object:
     return obj
 
 
+def recorded(context: bpy.types.Context, job: Job, obj: bpy.types.Object, transfer: Transfer | TextureTransfer
+             ) -> BakeRecord:
+    """The record of what a job baked, with what only the scene knows."""
+    uv_map = job.texture.uv_map if job.texture else ""
+    now = job.fingerprint
+    if job.bounces and transfer.record.colours == 1:  # nothing bounced: no colour counts
+        now = fingerprint(obj, context.evaluated_depsgraph_get(), job.occluders,
+                          read_uv(obj.data, uv_map) if uv_map else None)
+    return replace(transfer.record, occluders=job.occluders, fingerprint=now, frame=job.frame, uv_map=uv_map)
+
+
 def finish(context: bpy.types.Context, job: Job, transfer: Transfer | TextureTransfer,
            images: Sequence[bpy.types.Image] = ()) -> tuple[BakeRecord, str]:
     """Write the bake, light it from the World and show it.
@@ -198,23 +206,19 @@ def finish(context: bpy.types.Context, job: Job, transfer: Transfer | TextureTra
             cannot be written.
     """
     obj = check(context, job)
-    depsgraph = context.evaluated_depsgraph_get()
-    uv_map = job.texture.uv_map if job.texture else ""
-    now = job.fingerprint
-    if job.bounces and transfer.record.colours == 1:  # nothing bounced: no colour counts
-        now = fingerprint(obj, depsgraph, job.occluders, read_uv(obj.data, uv_map) if uv_map else None)
-    record = replace(transfer.record, occluders=job.occluders, fingerprint=now, frame=job.frame, uv_map=uv_map)
+    record = recorded(context, job, obj, transfer)
     if isinstance(transfer, TextureTransfer):
         assert job.texture is not None
         if job.texture.own_uv:
-            now = fingerprint(obj, depsgraph, job.occluders, transfer.uv.astype(np.float32), record.colours == 3)
+            now = fingerprint(obj, context.evaluated_depsgraph_get(), job.occluders, transfer.uv.astype(np.float32),
+                              record.colours == 3)
             record = replace(record, fingerprint=now)
         write_textures(obj, replace(transfer, record=record), own_uv=job.texture.own_uv, folder=job.texture.folder,
                        half=job.texture.half, images=images)
         if job.texture.tiles is not None:
             remove_tiles(job.texture.tiles)
     else:
-        write_transfer(obj, job.read.mesh, replace(transfer, record=record))
+        write_transfer(obj, job.read.mesh.elements, replace(transfer, record=record))
     record = read_record(obj)
     warning = ""
     try:

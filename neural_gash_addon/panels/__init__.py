@@ -15,8 +15,8 @@ from ..ops import state
 from ..ops.job import percent
 from ..ops.preset import PRESETS, preset_in_force
 from ..properties import COLLECTION, DENSITY, FIT, RAYS, TEXTURE, NeuralGashSettings
-from ..scene import staleness
-from ..scene.attributes import RECORD, has_bake
+from ..scene import live, staleness
+from ..scene.attributes import RECORD, SEQUENCE, has_bake
 from ..scene.gloss_bounce import bounces_shown, has_bounces
 from ..scene.lighting import HDRI, SKY, problem
 from ..scene.preview import is_on
@@ -207,6 +207,34 @@ class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):
         layout.prop(settings, "texture_folder")
 
 
+class NEURAL_GASH_PT_animation(_Panel, bpy.types.Panel):
+    """Meshes that deform."""
+
+    bl_idname = "NEURAL_GASH_PT_animation"
+    bl_label = "Animation"
+    bl_parent_id = "NEURAL_GASH_PT_main"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Follow while posing, or bake every frame."""
+        layout, settings, obj = self.layout, context.scene.neural_gash, context.object
+        row = layout.row(align=True)
+        row.prop(settings, "live", toggle=True, icon="PLAY")
+        row.prop(settings, "live_budget")
+        if live.problem(obj):
+            _paragraph(layout.column(align=True), live.problem(obj), "ERROR")
+        elif settings.live and live.status(obj):
+            _paragraph(layout.column(align=True), live.status(obj), "CHECKMARK")
+        if state.running:
+            return
+        layout.operator("neural_gash.bake_sequence", icon="RENDER_ANIMATION")
+        column = layout.column()
+        column.use_property_split = True
+        column.prop(settings, "sequence_folder")
+        if obj is not None and obj.type == "MESH" and isinstance(obj.data.get(SEQUENCE), str):
+            _paragraph(layout.column(align=True), f"Plays {obj.data[SEQUENCE]}", "FILE_MOVIE")
+
+
 class NEURAL_GASH_PT_compare(_Panel, bpy.types.Panel):
     """Which method is best here."""
 
@@ -226,7 +254,7 @@ class NEURAL_GASH_PT_compare(_Panel, bpy.types.Panel):
 
 
 CLASSES = (NEURAL_GASH_PT_main, NEURAL_GASH_PT_light, NEURAL_GASH_PT_view, NEURAL_GASH_PT_settings,
-           NEURAL_GASH_PT_compare)
+           NEURAL_GASH_PT_animation, NEURAL_GASH_PT_compare)
 
 
 def register() -> None:

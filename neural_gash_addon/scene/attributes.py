@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.errors import UserError
-from ..backend.geometry import POINT, TEXEL, TriangleMesh
+from ..backend.geometry import POINT, TEXEL
 from ..backend.record import BakeRecord
 from ..backend.spherical_harmonics import MAX_ORDER
 from ..backend.texture import TextureTransfer
@@ -28,6 +28,7 @@ from .images import attach, bake_images, detach, make_images
 from .uv_maps import check_room, remove_own_uv, write_own_uv
 
 RECORD = "neural_gash"  # custom property on the mesh
+SEQUENCE = "neural_gash_sequence"  # another: the file that holds its bake of every frame of an animation
 PREFIX = "_prt_"
 CHANNELS = 4
 _OURS = re.compile(rf"{PREFIX}\d+")  # chosen as 'the' colour by Blender, not by a person
@@ -43,11 +44,11 @@ def has_bake(obj: bpy.types.Object | None) -> bool:
     return obj is not None and obj.type == "MESH" and isinstance(obj.data.get(RECORD), str)
 
 
-def write_transfer(obj: bpy.types.Object, mesh: TriangleMesh, transfer: Transfer) -> None:
+def write_transfer(obj: bpy.types.Object, elements: NDArray[np.int32], transfer: Transfer) -> None:
     """Store a bake on the object's mesh in place of any earlier one.
 
     Args:
-        mesh: the mesh as it was read from `obj` for this bake.
+        elements: (E,) of the mesh as it was read from `obj` for this bake.
         transfer: coefficients (N, K) of its points, and their record.
     Raises:
         UserError: the mesh has changed since it was read, is in Edit Mode, or has attributes of
@@ -55,7 +56,8 @@ def write_transfer(obj: bpy.types.Object, mesh: TriangleMesh, transfer: Transfer
     """
     data = obj.data
     _check_mode(obj)
-    if len(mesh.elements) != len(data.vertices if mesh.domain == POINT else data.loops):
+    domain = transfer.record.domain
+    if len(elements) != len(data.vertices if domain == POINT else data.loops):
         raise UserError(f"'{obj.name}' was changed while it was being baked; bake again.")
     count = attribute_count(transfer.record.terms)
     own = _own_attributes(data)
@@ -68,13 +70,13 @@ def write_transfer(obj: bpy.types.Object, mesh: TriangleMesh, transfer: Transfer
     chosen = _chosen_attributes(data)
     terms = transfer.record.terms
     flat = transfer.coefficients.reshape(len(transfer.coefficients), terms)
-    values = np.zeros((len(mesh.elements), CHANNELS), np.float32)
+    values = np.zeros((len(elements), CHANNELS), np.float32)
     for index in range(count):
         part = flat[:, CHANNELS * index:CHANNELS * (index + 1)]
         width = min(CHANNELS, terms - CHANNELS * index)
-        values[:, :width] = part[mesh.elements]
+        values[:, :width] = part[elements]
         values[:, width:] = 0
-        attribute = data.attributes.new(f"{PREFIX}{index}", "FLOAT_COLOR", mesh.domain)
+        attribute = data.attributes.new(f"{PREFIX}{index}", "FLOAT_COLOR", domain)
         attribute.data.foreach_set("color", values.ravel())
     _choose_attributes(data, chosen)
     data[RECORD] = transfer.record.to_json()
@@ -175,6 +177,7 @@ def discard(data: bpy.types.Mesh, keep_uv: bool = False) -> None:
     detach(data)
     discard_bounces(data)
     del data[RECORD]
+    data.pop(SEQUENCE, None)
     data.update_tag()
 
 

@@ -82,7 +82,7 @@ class Maker:
             seconds=0.0, error_estimate=None, occluders=occluders, frame=scene_mesh.frame,
             fingerprint=read.fingerprint(obj, cls.depsgraph(), occluders))
         transfer = Transfer(values, record)
-        attributes.write_transfer(obj, scene_mesh.mesh, transfer)
+        attributes.write_transfer(obj, scene_mesh.mesh.elements, transfer)
         return scene_mesh.mesh, transfer
 
 

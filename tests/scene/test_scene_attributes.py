@@ -80,7 +80,7 @@ def test_a_changed_mesh_is_noticed(make):
     obj, other = make.cube(), make.grid()
     _, transfer = make.bake(other)
     with pytest.raises(UserError, match="changed"):
-        attributes.write_transfer(obj, read.read_object(other, make.depsgraph()).mesh, transfer)
+        attributes.write_transfer(obj, read.read_object(other, make.depsgraph()).mesh.elements, transfer)
     assert not _names(obj)
 
 

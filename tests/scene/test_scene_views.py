@@ -39,7 +39,7 @@ def _even(obj, row):
     from neural_gash_addon.scene import attributes, read
     values, record = read_transfer(obj)
     mesh = read.read_object(obj, bpy.context.evaluated_depsgraph_get()).mesh
-    attributes.write_transfer(obj, mesh, Transfer(np.tile(np.float32(row), (len(values), 1)), record))
+    attributes.write_transfer(obj, mesh.elements, Transfer(np.tile(np.float32(row), (len(values), 1)), record))
 
 
 ROW = np.array([0.2, -0.11, 0.07, 0.3, -0.05, 0.02, 0.13, -0.2, 0.09])

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Bake Sequence: every frame of the scene's range, one file for each object, shown as the frames are."""
+from __future__ import annotations
+
+import time
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import bpy
+
+from ..backend.errors import UserError
+from ..backend.exchange import check_folder
+from ..backend.progress import scaled
+from ..backend.sequence import SUFFIX, Writer
+from ..backend.transfer import Transfer
+from ..properties import TEXTURE
+from ..scene.attributes import SEQUENCE
+from ..scene.live import suspended
+from .bake import Baking, Worker, bake_refusal, targets
+from .batch import Outcome
+from .job import Job, finish, prepare, recorded
+
+_TURN = 0.04  # seconds of work between two looks at the window
+
+
+class Steps(Worker):
+    """A bake that sets the scene's frames, so on the main thread: a piece of it whenever the window has time."""
+
+    def start(self) -> None:
+        """Nothing runs beside."""
+        self._alive = True
+
+    def is_alive(self) -> bool:
+        """Whether it has not ended."""
+        return self._alive
+
+    def step(self) -> None:
+        """A piece of the work."""
+        until = time.perf_counter() + _TURN
+        try:
+            while time.perf_counter() < until:
+                self.progress = next(self._baking)
+        except StopIteration as end:
+            self.results, self._alive = end.value, False
+        except UserError as error:
+            self.error, self._alive = error, False
+
+    def cancel(self) -> None:
+        """Stop, and give the scene its frame back."""
+        self._baking.close()
+        self._alive = False
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceBatch:
+    """As `Batch`: what is baked, and how."""
+
+    names: list[str]
+    baking: Generator[float, None, list[Outcome]]
+
+
+def bake_sequence(context: bpy.types.Context, objects: list[bpy.types.Object]
+                  ) -> Generator[float, None, list[Outcome]]:
+    """Bake objects in all frames of the scene's range; at the end, show the current one.
+
+    Yields:
+        The share that is done. `close()` leaves no file, and the scene at the frame where it was.
+    Returns:
+        What became of each object.
+    Raises:
+        UserError: none could be baked.
+    """
+    scene, settings = context.scene, context.scene.neural_gash
+    current, first, count = scene.frame_current, scene.frame_start, scene.frame_end - scene.frame_start + 1
+    folder = _folder(settings.sequence_folder)
+    uids = {obj.session_uid: obj.name for obj in objects}
+    outcomes: list[Outcome] = []
+    writers: dict[int, Writer] = {}
+    last: dict[int, tuple[Job, Transfer]] = {}
+
+    def frame(uid: int, number: int) -> Generator[float, None, None]:
+        """Bake one object in one frame."""
+        obj = _object(uid, uids[uid])
+        job = prepare(context, obj, settings, group=[_object(*other) for other in uids.items()])
+        found = yield from job.bake()
+        assert isinstance(found, Transfer)
+        transfer = replace(found, record=recorded(context, job, obj, found))
+        if uid not in writers:
+            writers[uid] = Writer(_file(folder, obj), first, count, job.read.mesh)
+        writers[uid].add(job.read.mesh, transfer)
+        last[uid] = job, transfer
+
+    try:
+        with suspended():
+            for number in range(count):
+                scene.frame_set(first + number)
+                for place, uid in enumerate(list(uids)):
+                    try:
+                        share = 1 / (count * len(objects))
+                        yield from scaled(frame(uid, number), number / count + place * share, share)
+                    except UserError as error:
+                        outcomes.append(Outcome(uids[uid], None, f"'{uids[uid]}', frame {first + number}: {error}"))
+                        del uids[uid]
+                if not uids:
+                    raise UserError(outcomes[-1].sentence)
+            for uid, name in uids.items():
+                writers[uid].end()
+                outcomes.append(Outcome(name, *finish(context, *last[uid])))
+                obj = _object(uid, name)
+                path = str(_file(folder, obj))
+                obj.data[SEQUENCE] = path if settings.sequence_folder else bpy.path.relpath(path)
+        return outcomes
+    finally:
+        for writer in writers.values():
+            writer.discard()
+        scene.frame_set(current)  # and what is shown with it
+
+
+def _object(uid: int, name: str) -> bpy.types.Object:
+    """An object by its session uid. Raises UserError where it is gone."""
+    obj = next((o for o in bpy.data.objects if o.session_uid == uid), None)
+    if obj is None:
+        raise UserError(f"'{name}' was deleted while it was being baked.")
+    return obj
+
+
+def _folder(chosen: str) -> Path:
+    """Where sequences are written. Raises UserError where nothing can be."""
+    if not chosen and not bpy.data.filepath:
+        raise UserError("Save the .blend file first, or choose a folder: the sequence is kept in a file beside it.")
+    folder = Path(bpy.path.abspath(chosen or "//"))
+    check_folder(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _file(folder: Path, obj: bpy.types.Object) -> Path:
+    """The file of an object's sequence."""
+    return folder / f"{bpy.path.clean_name(obj.name)}{SUFFIX}"
+
+
+class NEURAL_GASH_OT_bake_sequence(Baking, bpy.types.Operator):
+    """Bake the active mesh and other selected ones in every frame of the scene, into a file; playback reads it"""
+
+    bl_idname = "neural_gash.bake_sequence"
+    bl_label = "Bake Sequence"
+    bl_options = {"REGISTER", "UNDO"}
+
+    _doing = "baking all frames of"
+    _worker_type = Steps
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """As Bake; and to vertices."""
+        reason = bake_refusal(context)
+        if not reason and context.scene.neural_gash.target == TEXTURE:
+            reason = "A sequence is baked to vertices; choose them as the target."
+        if reason:
+            cls.poll_message_set(reason)
+        return not reason
+
+    def _prepare(self, context: bpy.types.Context, tiles=None) -> SequenceBatch:
+        """Nothing is read yet: each frame is, in its turn."""
+        objects = targets(context)
+        _folder(context.scene.neural_gash.sequence_folder)
+        return SequenceBatch([obj.name for obj in objects], bake_sequence(context, objects))
+
+    def _finish(self, context: bpy.types.Context, batch, results) -> set[str]:
+        """All is written already."""
+        return self._report(results)
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """As Bake; a piece of the work at each tick."""
+        assert isinstance(self._worker, Steps)
+        if event.type == "TIMER" and self._worker.is_alive():
+            self._worker.step()
+        return super().modal(context, event)

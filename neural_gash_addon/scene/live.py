@@ -1,0 +1,311 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Bakes that follow their objects while these deform: made anew within a budget of time, or read from a sequence.
+
+The dependency graph says what changed; the fingerprint says whether a bake still fits. What is drawn interactively is
+made within the milliseconds that the person gives; frames that are rendered are made as Bake would.
+"""
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..backend import methods
+from ..backend.errors import UserError
+from ..backend.geometry import TEXEL, TriangleMesh
+from ..backend.live import Live, LivePlan
+from ..backend.record import BakeRecord
+from ..backend.sequence import Sequence, open_sequence
+from ..backend.transfer import Transfer
+from .attributes import SEQUENCE, has_bake, read_record, write_transfer
+from .deforming import Deforming
+from .frames import rotation_part
+from .lighting import light_object
+from .read import SELF, fingerprint, read_occluders, refusal, same_fingerprint
+
+_OVERHEAD = 0.15                   # of the budget: reading, writing, and what varies from frame to frame
+
+
+@dataclass(eq=False)
+class _Follower:
+    """What is kept of an object from frame to frame. Arrays only."""
+
+    reader: Deforming = field(default_factory=Deforming)
+    live: Live | None = None
+    plan: LivePlan | None = None
+    order: int = 0
+    budget: float = 0.0
+    seconds: float = 0.0  # the last update took
+
+
+_followers: dict[int, _Follower] = {}        # by session uid of the object
+_problems: dict[int, str] = {}               # why an object is not followed
+_sequences: dict[str, tuple[float, Sequence]] = {}  # path -> when the file was written, and the file
+_suspended = False                           # something else bakes frame by frame
+_rendering = False
+
+
+def status(obj: bpy.types.Object | None) -> str:
+    """How the object is followed, in one sentence; '' where it is not. Reads nothing of the mesh."""
+    follower = None if obj is None else _followers.get(obj.session_uid)
+    if follower is None or follower.plan is None:
+        return ""
+    return _sentence(follower.plan, follower.seconds or follower.plan.seconds, follower.budget)
+
+
+def _sentence(plan: LivePlan, seconds: float, budget: float) -> str:
+    """A plan and what it takes, for people."""
+    what = f"{plan.rays} rays" if plan.rays else "The network"
+    late = ", and no plan is quicker" if plan.seconds > budget else ""
+    return (f"{what} at {plan.points:,} points: {1000 * seconds:.0f} ms{late}; error about "
+            f"{100 * plan.error:.2g} %.")
+
+
+def problem(obj: bpy.types.Object | None) -> str:
+    """Why the object could not be followed when last it changed; '' where it could."""
+    return "" if obj is None else _problems.get(obj.session_uid, "")
+
+
+@contextmanager
+def suspended() -> Iterator[None]:
+    """Follow nothing meanwhile."""
+    global _suspended
+    _suspended = True
+    try:
+        yield
+    finally:
+        _suspended = False
+
+
+def start(scene: bpy.types.Scene) -> None:
+    """Choose how to follow each baked object of a scene that is shown, and follow it from now on."""
+    forget()
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    for obj in _followed(scene, rendered=False):
+        try:
+            record = _followable(obj)
+            follower = _followers.setdefault(obj.session_uid, _Follower())
+            mesh, _ = follower.reader.read(obj, depsgraph)
+            _plan(scene, follower, mesh, read_occluders(obj, record.occluders, depsgraph), record.order)
+        except UserError as error:
+            _problems[obj.session_uid] = str(error)
+    follow(scene, depsgraph)
+
+
+def forget() -> None:
+    """Follow nothing any more."""
+    _followers.clear()
+    _problems.clear()
+
+
+def follow(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, rendered: bool = False,
+           changed: Collection[int] | None = None) -> list[bpy.types.Object]:
+    """Bring the bakes of a scene to how their objects stand evaluated; what fits already is left alone.
+
+    Args:
+        rendered: as well as Bake would, not within the budget.
+        changed: session uids of the objects that changed; all, where not given.
+    Returns:
+        The objects to which bakes were written.
+    """
+    written: list[bpy.types.Object] = []
+    if not scene.neural_gash.live:
+        return written
+    for obj in _followed(scene, rendered):
+        try:
+            heeded = changed is None or obj.session_uid in changed or read_record(obj).occluders != SELF
+            if heeded and _update(scene, obj, depsgraph, rendered):
+                written.append(obj)
+            _problems.pop(obj.session_uid, None)
+        except UserError as error:
+            _problems[obj.session_uid] = str(error)
+    return written
+
+
+def _followed(scene: bpy.types.Scene, rendered: bool) -> list[bpy.types.Object]:
+    """The objects whose bakes follow; of several with the same mesh, the first."""
+    found: dict[int, bpy.types.Object] = {}
+    for obj in scene.objects:
+        shown = not obj.hide_render if rendered else obj.visible_get()
+        if has_bake(obj) and SEQUENCE not in obj.data and shown and obj.mode != "EDIT":
+            found.setdefault(obj.data.session_uid, obj)
+    return list(found.values())
+
+
+def _followable(obj: bpy.types.Object) -> BakeRecord:
+    """The record of a bake that can be made again and again. Raises UserError where it cannot."""
+    reason = refusal(obj)
+    if reason:
+        raise UserError(reason)
+    record = read_record(obj)
+    if record.domain == TEXEL:
+        raise UserError(f"'{obj.name}' is baked to a texture; live updates are for bakes to vertices.")
+    if record.colours != 1:
+        raise UserError(f"Light bounces in the bake of '{obj.name}'; live updates are for bakes without bounces.")
+    return record
+
+
+def _update(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, rendered: bool) -> bool:
+    """Bake an object again, if it is no longer as it was baked. Raises UserError."""
+    before = _followable(obj)
+    began = time.perf_counter()
+    now = fingerprint(obj, depsgraph, before.occluders)
+    if same_fingerprint(now, before.fingerprint):
+        return False
+    follower = _followers.setdefault(obj.session_uid, _Follower())
+    mesh, matrix = follower.reader.read(obj, depsgraph)
+    occluders = read_occluders(obj, before.occluders, depsgraph)
+    if rendered:
+        settings = scene.neural_gash
+        transfer = methods.run(methods.bake(mesh, settings.method, before.order, occluders=occluders,
+                                            **settings.tracing()))
+    else:
+        plan = _plan(scene, follower, mesh, occluders, before.order)
+        assert follower.live is not None
+        found = follower.live.bake(mesh, occluders, plan)
+        took = time.perf_counter() - began
+        transfer = Transfer(found, BakeRecord(
+            method=plan.method, order=before.order, points=len(mesh.points), domain=mesh.domain,
+            rays=(plan.rays or 0) * plan.points, seed=0, seconds=took, error_estimate=plan.error,
+            plan=f"Live. {_sentence(plan, took, follower.budget)}"))
+    frame = tuple(float(v) for v in rotation_part(matrix).ravel())
+    record = replace(transfer.record, occluders=before.occluders, fingerprint=now, frame=frame)
+    write_transfer(obj, mesh.elements, replace(transfer, record=record))
+    if frame != before.frame:
+        light_object(scene, obj)
+    follower.seconds = time.perf_counter() - began
+    return True
+
+
+def _plan(scene: bpy.types.Scene, follower: _Follower, mesh: TriangleMesh, occluders: list, order: int) -> LivePlan:
+    """How to bake within the budget; chosen anew where the topology, the order or the budget is another."""
+    budget = scene.neural_gash.live_budget / 1000
+    if follower.live is None or follower.order != order or not follower.live.fits(mesh):
+        follower.live, follower.order, follower.plan = Live(mesh, order), order, None
+    if follower.plan is None or follower.budget != budget:
+        follower.plan = follower.live.choose(mesh, occluders, (1 - _OVERHEAD) * budget)
+        follower.budget = budget
+    return follower.plan
+
+
+def _animate_again(scene: bpy.types.Scene, written: Collection[bpy.types.Object]) -> None:
+    """Have what animates objects evaluated once more after their meshes were written to in a new frame.
+
+    A mesh that changed is evaluated again from the originals of the mesh, its shape keys and its objects. In the window
+    these hold the values of the frame; but a render has a dependency graph of its own, and they would be those of the
+    frame that the window shows. Not while posing: values that a person has not keyed yet would be lost.
+    """
+    meshes = {obj.data for obj in written}
+    changed: set[bpy.types.ID] = {obj for obj in scene.objects if obj.data in meshes}
+    changed |= meshes | {mesh.shape_keys for mesh in meshes if mesh.shape_keys}
+    for one in changed:
+        one.update_tag(refresh={"TIME"})
+
+
+def play(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """Show of each object with a sequence the frame that is current; the nearest, beyond its ends. Gives those written.
+    """
+    shown: set[int] = set()
+    written = []
+    for obj in scene.objects:
+        if obj.type != "MESH" or SEQUENCE not in obj.data or obj.data.session_uid in shown or obj.mode == "EDIT":
+            continue
+        shown.add(obj.data.session_uid)
+        try:
+            if _show_frame(scene, obj):
+                written.append(obj)
+            _problems.pop(obj.session_uid, None)
+        except UserError as error:
+            _problems[obj.session_uid] = str(error)
+    return written
+
+
+def _show_frame(scene: bpy.types.Scene, obj: bpy.types.Object) -> bool:
+    """Write the current frame of a sequence to its object, if it is another. Raises UserError."""
+    before = read_record(obj)
+    sequence = _sequence(str(obj.data[SEQUENCE]))
+    coefficients, record = sequence.frame(scene.frame_current)
+    if same_fingerprint(record.fingerprint, before.fingerprint):
+        return False
+    name = obj.data[SEQUENCE]
+    write_transfer(obj, sequence.elements, Transfer(coefficients, record))
+    obj.data[SEQUENCE] = name
+    if record.frame != before.frame:
+        light_object(scene, obj)
+    return True
+
+
+def _sequence(name: str) -> Sequence:
+    """The file that a mesh names, mapped once. Raises UserError."""
+    path = Path(bpy.path.abspath(name))
+    try:
+        written = path.stat().st_mtime
+    except OSError as error:
+        raise UserError(f"The sequence '{path}' is missing; bake it again, or clear the bake.") from error
+    if name not in _sequences or _sequences[name][0] != written:
+        _sequences[name] = written, open_sequence(path)
+    return _sequences[name][1]
+
+
+@persistent
+def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    """Follow what was posed, edited or moved."""
+    if _suspended or not scene.neural_gash.live:
+        return
+    changed = {update.id.original.session_uid for update in depsgraph.updates
+               if isinstance(update.id, bpy.types.Object)
+               and (update.is_updated_geometry or update.is_updated_transform)}
+    if changed:
+        follow(scene, depsgraph, bpy.app.background or _rendering, changed)
+
+
+@persistent
+def _on_frame(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    """Follow what is animated, before it is drawn or rendered."""
+    if not _suspended:
+        written = play(scene) + follow(scene, depsgraph, bpy.app.background or _rendering)
+        _animate_again(scene, written)
+
+
+@persistent
+def _on_load(*_: object) -> None:
+    """Another file: nothing known holds."""
+    forget()
+    _sequences.clear()
+
+
+@persistent
+def _on_render(*_: object) -> None:
+    """A render begins."""
+    global _rendering
+    _rendering = True
+
+
+@persistent
+def _on_rendered(*_: object) -> None:
+    """It ended, however."""
+    global _rendering
+    _rendering = False
+
+
+_HANDLERS = (("depsgraph_update_post", _on_update), ("frame_change_post", _on_frame), ("load_post", _on_load),
+             ("render_init", _on_render), ("render_complete", _on_rendered), ("render_cancel", _on_rendered))
+
+
+def register() -> None:
+    """Start following."""
+    for name, handler in _HANDLERS:
+        getattr(bpy.app.handlers, name).append(handler)
+
+
+def unregister() -> None:
+    """Stop, and forget."""
+    for name, handler in _HANDLERS:
+        getattr(bpy.app.handlers, name).remove(handler)
+    _on_load()
+    _on_rendered()
