@@ -42,6 +42,14 @@ class LivePlan:
     error: float      # rel L2, then
 
 
+def best(plans: Sequence[LivePlan], seconds: float) -> LivePlan:
+    """The plan with the smallest error of those that take no more than `seconds`; the quickest, where none does."""
+    within = [plan for plan in plans if plan.seconds <= seconds]
+    if not within:
+        return min(plans, key=lambda plan: plan.seconds)
+    return min(within, key=lambda plan: (max(plan.error, _ALIKE), -plan.seconds))
+
+
 class Live:
     """A deforming mesh: fixed topology, baked again and again."""
 
@@ -62,7 +70,7 @@ class Live:
         return np.array_equal(mesh.triangles, self._triangles) and np.array_equal(mesh.elements, self._elements)
 
     def bake(self, mesh: TriangleMesh, occluders: Sequence[Geometry], plan: LivePlan) -> NDArray[np.float32]:
-        """Transfer (N, K) of the mesh as it stands, by a plan of `choose`."""
+        """Transfer (N, K) of the mesh as it stands, by a plan of `tried`."""
         steps = self._levels[:plan.level]
         meshes = [mesh]
         for level in steps:
@@ -87,11 +95,9 @@ class Live:
         blocked[:, 1:] += blocked[:, :1] * unshadowed[:, 1:] / np.float32(FULL)
         return unshadowed - blocked
 
-    def choose(self, mesh: TriangleMesh, occluders: Sequence[Geometry], seconds: float) -> LivePlan:
-        """The plan with the smallest error of those that take no more than `seconds`; the quickest, where none does.
-
-        Every plan is tried on the mesh as it stands, from the coarsest level and the fewest rays up to those that
-        take longer.
+    def tried(self, mesh: TriangleMesh, occluders: Sequence[Geometry], seconds: float) -> list[LivePlan]:
+        """Plans with what they take and how they err, tried on the mesh as it stands: from the coarsest level and the
+        fewest rays up to the first that take longer than `seconds`. Some of them always are.
         """
         rng = np.random.default_rng([self._seed, 3])
         sample = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
@@ -113,10 +119,7 @@ class Live:
                 took = min(took, time.perf_counter() - began)
             error = float(np.square(found[sample] - truth).sum() / energy) ** 0.5
             tried.append(replace(plan, seconds=took, error=error))
-        within = [plan for plan in tried if plan.seconds <= seconds]
-        if not within:
-            return min(tried, key=lambda plan: plan.seconds)
-        return min(within, key=lambda plan: (max(plan.error, _ALIKE), -plan.seconds))
+        return tried
 
     def _plans(self) -> Iterator[LivePlan]:
         """Every plan, from the coarsest level."""

@@ -97,7 +97,7 @@ class NEURAL_GASH_PT_main(_Panel, bpy.types.Panel):
         if record.bounces:
             column.label(text=f"Bounces: {record.bounces}")
         column.label(text=f"Time: {record.seconds:.2f} s")
-        if record.rays:
+        if record.rays_per_point >= 0.5:
             column.label(text=f"Rays: {record.rays_per_point:.0f} a point")
         if record.error_estimate is not None:
             column.label(text=f"Estimated error: {percent(record.error_estimate)}")

@@ -18,7 +18,7 @@ from bpy.app.handlers import persistent
 from ..backend import methods
 from ..backend.errors import UserError
 from ..backend.geometry import TEXEL, TriangleMesh
-from ..backend.live import Live, LivePlan
+from ..backend.live import Live, LivePlan, best
 from ..backend.record import BakeRecord
 from ..backend.sequence import Sequence, open_sequence
 from ..backend.transfer import Transfer
@@ -28,7 +28,9 @@ from .frames import rotation_part
 from .lighting import light_object
 from .read import SELF, fingerprint, read_occluders, refusal, same_fingerprint
 
-_OVERHEAD = 0.15                   # of the budget: reading, writing, and what varies from frame to frame
+_SLOW = 1.2      # an update also reads and writes, besides what its plan says
+_NEWEST = 0.2    # weight of the newest update in how slow updates are
+_ROOM = 0.7      # of the budget that a better plan must keep to, to be taken again: so that plans do not alternate
 
 
 @dataclass(eq=False)
@@ -37,7 +39,9 @@ class _Follower:
 
     reader: Deforming = field(default_factory=Deforming)
     live: Live | None = None
+    plans: list[LivePlan] = field(default_factory=list)
     plan: LivePlan | None = None
+    slow: float = _SLOW   # how many times as long an update takes as its plan took when it was tried
     order: int = 0
     budget: float = 0.0
     seconds: float = 0.0  # the last update took
@@ -61,7 +65,7 @@ def status(obj: bpy.types.Object | None) -> str:
 def _sentence(plan: LivePlan, seconds: float, budget: float) -> str:
     """A plan and what it takes, for people."""
     what = f"{plan.rays} rays" if plan.rays else "The network"
-    late = ", and no plan is quicker" if plan.seconds > budget else ""
+    late = ", more than the budget" if seconds > 1.1 * budget else ""
     return (f"{what} at {plan.points:,} points: {1000 * seconds:.0f} ms{late}; error about "
             f"{100 * plan.error:.2g} %.")
 
@@ -179,6 +183,8 @@ def _update(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types.
     if frame != before.frame:
         light_object(scene, obj)
     follower.seconds = time.perf_counter() - began
+    if not rendered:
+        _adapt(follower)
     return True
 
 
@@ -188,9 +194,24 @@ def _plan(scene: bpy.types.Scene, follower: _Follower, mesh: TriangleMesh, occlu
     if follower.live is None or follower.order != order or not follower.live.fits(mesh):
         follower.live, follower.order, follower.plan = Live(mesh, order), order, None
     if follower.plan is None or follower.budget != budget:
-        follower.plan = follower.live.choose(mesh, occluders, (1 - _OVERHEAD) * budget)
-        follower.budget = budget
+        follower.plans = follower.live.tried(mesh, occluders, budget / _SLOW)
+        follower.plan, follower.budget, follower.slow = best(follower.plans, budget / _SLOW), budget, _SLOW
     return follower.plan
+
+
+def _adapt(follower: _Follower) -> None:
+    """Take another plan where updates turn out to be slower than the budget, or where there is room for a better one:
+    drawing takes its part of the machine, and so may other programs.
+    """
+    assert follower.plan is not None
+    follower.slow += _NEWEST * (follower.seconds / follower.plan.seconds - follower.slow)
+    room = follower.budget / follower.slow
+    if follower.plan.seconds > room:
+        follower.plan = best(follower.plans, room)
+    else:
+        better = best(follower.plans, _ROOM * room)
+        if better.seconds <= _ROOM * room and better.error < follower.plan.error:
+            follower.plan = better
 
 
 def _animate_again(scene: bpy.types.Scene, written: Collection[bpy.types.Object]) -> None:

@@ -12,7 +12,7 @@ from neural_gash_addon.backend import methods
 from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.geometry import TriangleMesh
 from neural_gash_addon.backend.hybrid_bake import at_once
-from neural_gash_addon.backend.live import Live, LivePlan
+from neural_gash_addon.backend.live import Live, LivePlan, best
 
 from .shapes import cube, sphere
 
@@ -91,7 +91,7 @@ def test_more_time_gives_less_error(monkeypatch):
     monkeypatch.setattr(Live, "bake", bake)
     monkeypatch.setattr("neural_gash_addon.backend.live.time.perf_counter", lambda: ticks[0])
     live = Live(mesh, 3)
-    plans = [live.choose(mesh, (), seconds) for seconds in (0.0, 0.004, 0.02, 1.0)]
+    plans = [best(live.tried(mesh, (), seconds), seconds) for seconds in (0.0, 0.004, 0.02, 1.0)]
     assert plans[0].rays == 2 and plans[0].level == 1 and plans[0].seconds > 0  # the quickest, though it is too slow
     assert all(plan.seconds <= seconds for plan, seconds in zip(plans[1:], (0.004, 0.02, 1.0), strict=True))
     errors = [plan.error for plan in plans]
@@ -106,7 +106,7 @@ def test_more_time_gives_less_error(monkeypatch):
 def test_split_normals_are_baked_at_every_point():
     mesh = TriangleMesh.from_triangles(*cube(subdivisions=4), smooth=False)
     live = Live(mesh, 3)
-    assert live.choose(mesh, (), 0.0).level == 0
+    assert {plan.level for plan in live.tried(mesh, (), 0.0)} == {0}
     np.testing.assert_allclose(live.bake(mesh, (), LivePlan("hybrid", 4, 0, 0, 0, 0)), sh.cosine_lobe(mesh.normals, 3),
                                atol=1e-6)
 
@@ -121,4 +121,4 @@ def test_another_topology_does_not_fit():
 def test_without_normals_nothing_is_lit():
     mesh = TriangleMesh.from_triangles(np.zeros((3, 3)), np.array([[0, 1, 2]]))
     live = Live(mesh, 3)
-    assert not live.bake(mesh, (), live.choose(mesh, (), 1.0)).any()
+    assert not live.bake(mesh, (), best(live.tried(mesh, (), 1.0), 1.0)).any()

@@ -182,6 +182,7 @@ def session():
     yield from cancelled()
     yield from baked()
     yield from followed()
+    yield from lived()
     yield from reopened()
     yield from textured()
     yield from deleted()
@@ -327,6 +328,52 @@ def followed():
     yield 1.0
     expect(np.allclose(light(), first, atol=1e-5), "undo_takes_the_light_back")
     view3d()[1].spaces.active.shading.type = "SOLID"
+
+
+def lived():
+    """Live: what a modifier does to the head is followed while a value is dragged, and while the animation plays."""
+    live, staleness = (sys.modules[f"{ID}.scene.{name}"] for name in ("live", "staleness"))
+    head, scene = suzanne(), bpy.context.scene
+    twist = head.modifiers.new("Twist", "SIMPLE_DEFORM")
+    twist.deform_method, twist.angle = "TWIST", 0.0
+    settings().live = True
+    yield 1.0
+    expect("ms; error about" in live.status(head) and not live.problem(head), "live_says_what_it_does")
+    facts["live"] = live.status(head)
+    took, before = [], coefficients()
+    for angle in np.linspace(0.1, 1.6, 12):
+        twist.angle = float(angle)
+        yield 0.05
+        took.append(live._followers[head.session_uid].seconds)
+        expect(not np.array_equal(coefficients(), before), "live_follows_a_drag")
+        before = coefficients()
+    facts["live_drag_ms"] = round(1000 * float(np.median(took)), 1)
+    yield 1.0
+    expect(staleness.status(head) == staleness.CURRENT, "live_is_up_to_date")
+    yield from picture("6c_live")
+    for frame, angle in ((1, 0.0), (24, 1.6)):
+        twist.angle = angle
+        twist.keyframe_insert("angle", frame=frame)
+    scene.frame_start, scene.frame_end = 1, 24
+    with in_view():
+        bpy.ops.screen.animation_play()
+    seen = set()
+    until = time.perf_counter() + 3
+    while time.perf_counter() < until:
+        seen.add(coefficients().tobytes())
+        yield 0.05
+    with in_view():
+        bpy.ops.screen.animation_cancel()
+    facts["live_frames_seen"] = len(seen)
+    expect(len(seen) > 2, "live_follows_playback")  # software GL draws few frames a second
+    settings().live = False
+    head.modifiers.remove(twist)
+    head.animation_data_clear()
+    scene.frame_set(1)
+    with in_view():
+        bpy.ops.ed.undo_push(message="Live over")
+    expect(bpy.ops.neural_gash.bake() == {"FINISHED"}, "baked_after_live")
+    yield 0.5
 
 
 def reopened():
