@@ -5,9 +5,9 @@
 def _parts():
     """What registers, in order; imported late, so that the backend can be used without bpy."""
     from . import cli, ops, panels, properties
-    from .scene import lighting, live, staleness
+    from .scene import lighting, live, staleness, viewport
 
-    return properties, ops, panels, live, lighting, staleness, cli
+    return properties, ops, panels, live, lighting, viewport, staleness, cli
 
 
 def register() -> None:

@@ -25,6 +25,7 @@ from .backend.spherical_harmonics import MAX_ORDER
 from .scene import live
 from .scene.lighting import HDRI, SKY, SUNS, WORLD, apply_light, follow_light, show_gloss
 from .scene.read import SELF, VISIBLE
+from .scene.viewport import follow_viewport
 from .scene.views import COEFFICIENT, LIT, OCCLUSION
 
 RAYS, TOLERANCE, COLLECTION = "RAYS", "TOLERANCE", "COLLECTION"
@@ -59,6 +60,12 @@ def _view_changed(settings: NeuralGashSettings, _context: bpy.types.Context) -> 
         show_gloss(settings.id_data)
     else:
         apply_light(settings.id_data)
+
+
+def _viewport_changed(settings: NeuralGashSettings, _context: bpy.types.Context) -> None:
+    """The rotation is the viewport's from now on, or no longer."""
+    if settings.with_viewport:
+        follow_viewport(settings.id_data, anew=True)
 
 
 def _live_changed(settings: NeuralGashSettings, _context: bpy.types.Context) -> None:
@@ -148,6 +155,10 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
     light_rotation: FloatProperty(  # type: ignore[valid-type]
         name="Rotation", default=0.0, subtype="ANGLE", soft_min=-math.pi, soft_max=math.pi,
         description="Turn the light of the previews about the vertical axis", update=_light_changed)
+    with_viewport: BoolProperty(  # type: ignore[valid-type]
+        name="Turn with Viewport", default=False, update=_viewport_changed,
+        description="Turn the light of the previews with the rotation of the HDRI in Material Preview, which is in the "
+                    "viewport's shading options")
     light_strength: FloatProperty(  # type: ignore[valid-type]
         name="Strength", default=1.0, min=0.0, max=1e9, soft_max=10.0,
         description="Brighten or dim the light of the previews", update=_light_changed)

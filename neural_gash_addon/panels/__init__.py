@@ -125,6 +125,7 @@ class NEURAL_GASH_PT_light(_Panel, bpy.types.Panel):
         if problem(context.scene):
             _paragraph(layout.column(align=True), problem(context.scene), "ERROR")
         layout.prop(settings, "light_rotation")
+        layout.prop(settings, "with_viewport")
         layout.prop(settings, "light_strength")
         layout.prop(settings, "soften")
         layout.prop(settings, "gloss")

@@ -182,6 +182,7 @@ def session():
     yield from cancelled()
     yield from baked()
     yield from followed()
+    yield from turned()
     yield from lived()
     yield from reopened()
     yield from textured()
@@ -328,6 +329,23 @@ def followed():
     yield 1.0
     expect(np.allclose(light(), first, atol=1e-5), "undo_takes_the_light_back")
     view3d()[1].spaces.active.shading.type = "SOLID"
+
+
+def turned():
+    """The HDRI of the viewport is turned by its own option: the light of the preview turns with it."""
+    before = light()
+    settings().with_viewport = True
+    shading = view3d()[1].spaces.active.shading
+    shading.studiolight_rotate_z = 0.7
+    yield 0.5
+    expect(abs(settings().light_rotation + 0.7) < 1e-5, "the_viewport_turns_the_light")
+    expect(not np.allclose(light(), before), "and_the_preview")
+    settings().with_viewport = False
+    shading.studiolight_rotate_z = 0.0
+    yield 0.5
+    expect(abs(settings().light_rotation + 0.7) < 1e-5, "only_where_asked_for")
+    settings().light_rotation = 0.0
+    yield 0.2
 
 
 def lived():
