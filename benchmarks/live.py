@@ -66,7 +66,7 @@ def _line(name: str, frames: np.ndarray, faces: np.ndarray, budget: int, runs: i
         for _ in range(runs):
             scene.frame_set(1)
             with live.suspended():
-                scene.neural_gash.live, scene.neural_gash.live_budget = True, budget
+                scene.neural_gash.live, scene.neural_gash.live_budget = True, budget / 1000
                 live.start(scene)
                 times, stored = _play(obj, len(frames))
             found.append(np.median(times, 0))

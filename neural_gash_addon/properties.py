@@ -186,10 +186,11 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
         name="Live", default=False, update=_live_changed,
         description="Bakes to vertices follow their objects while these are posed or animated; frames that are "
                     "rendered are baked as the settings have it")
-    live_budget: IntProperty(  # type: ignore[valid-type]
-        name="Milliseconds", default=33, min=1, max=10000, soft_min=10, soft_max=200, update=_live_changed,
-        description="Time that an update of a live bake may take, in milliseconds: 33 is 30 frames a second. More "
-                    "gives better shadows; what there is time for is measured when Live is switched on")
+    live_budget: FloatProperty(  # type: ignore[valid-type]
+        name="Time", subtype="TIME_ABSOLUTE", default=0.033, min=0.001, max=10.0, soft_min=0.01, soft_max=0.2, step=0.1,
+        update=_live_changed,
+        description="Time that an update of a live bake may take: 33 ms is 30 frames a second. More gives better "
+                    "shadows; what there is time for is measured when Live is switched on")
     sequence_folder: StringProperty(  # type: ignore[valid-type]
         name="Folder", default="", subtype="DIR_PATH", options={"PATH_SUPPORTS_BLEND_RELATIVE"},
         description="Where to write the bake of an animation, one file for each object; leave empty to write it beside "

@@ -5,6 +5,7 @@ import bpy
 from . import state
 from .bake import NEURAL_GASH_OT_bake, NEURAL_GASH_OT_bake_applied_copy
 from .compare import NEURAL_GASH_OT_compare
+from .confidence import NEURAL_GASH_OT_show_confidence
 from .gloss_bounce import NEURAL_GASH_OT_bake_gloss
 from .preset import NEURAL_GASH_OT_preset
 from .preview import NEURAL_GASH_OT_clear, NEURAL_GASH_OT_preview, NEURAL_GASH_OT_read_light
@@ -13,7 +14,7 @@ from .view import NEURAL_GASH_OT_show_errors
 
 CLASSES = (NEURAL_GASH_OT_bake, NEURAL_GASH_OT_bake_applied_copy, NEURAL_GASH_OT_clear, NEURAL_GASH_OT_preview,
            NEURAL_GASH_OT_read_light, NEURAL_GASH_OT_bake_gloss, NEURAL_GASH_OT_compare, NEURAL_GASH_OT_preset,
-           NEURAL_GASH_OT_show_errors, NEURAL_GASH_OT_bake_sequence)
+           NEURAL_GASH_OT_show_errors, NEURAL_GASH_OT_bake_sequence, NEURAL_GASH_OT_show_confidence)
 
 
 def register() -> None:

@@ -160,6 +160,7 @@ class NEURAL_GASH_PT_view(_Panel, bpy.types.Panel):
                 layout.label(text=f"The bake has coefficients 0 to {record.order ** 2 - 1}", icon="ERROR")
             else:
                 layout.label(text=f"l = {band}, m = {settings.coefficient - band * (band + 1)}")
+        layout.operator("neural_gash.show_confidence")
         layout.operator("neural_gash.show_errors", depress=shows_errors(obj, context.space_data))
 
 

@@ -190,7 +190,7 @@ def _update(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types.
 
 def _plan(scene: bpy.types.Scene, follower: _Follower, mesh: TriangleMesh, occluders: list, order: int) -> LivePlan:
     """How to bake within the budget; chosen anew where the topology, the order or the budget is another."""
-    budget = scene.neural_gash.live_budget / 1000
+    budget = scene.neural_gash.live_budget
     if follower.live is None or follower.order != order or not follower.live.fits(mesh):
         follower.live, follower.order, follower.plan = Live(mesh, order), order, None
     if follower.plan is None or follower.budget != budget:

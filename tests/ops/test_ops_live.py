@@ -138,7 +138,7 @@ def test_a_render_of_the_animation_shows_no_stale_frame(wing, settings, tmp_path
 
 
 def test_live_keeps_to_its_plan_and_is_near_the_truth(wing, settings):
-    settings.live_budget, settings.live = 1000, True
+    settings.live_budget, settings.live = 1.0, True
     text = live.status(wing)
     assert "ms; error about" in text and not live.problem(wing), text
     with live.suspended():

@@ -122,3 +122,44 @@ def test_numbers_have_units(settings):
     plain = {"order", "rays", "bounces", "coefficient", "light_strength", "texels_per_metre"}
     assert {name for name, kind in kinds.items() if kind == "NONE"} == plain
     assert (kinds["side"], kinds["light_rotation"], kinds["tolerance"]) == ("PIXEL", "ANGLE", "FACTOR")
+
+
+def _point_colours(obj):
+    """(E, 3) of the attribute of errors."""
+    data = obj.data.attributes[ERRORS].data
+    values = np.empty((len(data), 4), np.float32)
+    data.foreach_get("color", values.ravel())
+    return values[:, :3]
+
+
+def test_confidence_is_shown_in_one_press(make, settings):
+    from .conftest import WEDGE
+    obj = make(*WEDGE, smooth=True)
+    settings.rays = 16
+    bpy.ops.neural_gash.bake()
+    obj.rotation_euler = (0.3, 1.0, -0.4)  # which changes nothing of it
+    bpy.context.view_layer.update()
+    place = _viewport()
+    with bpy.context.temp_override(**place):
+        assert bpy.ops.neural_gash.show_confidence() == {"FINISHED"}
+    assert _shading(place) == ("SOLID", "VERTEX")
+    first = _point_colours(obj)
+    assert np.ptp(first.sum(1)) > 0.1
+    obj.rotation_euler = (0, 0, 0)
+    bpy.context.view_layer.update()
+    bpy.ops.neural_gash.show_confidence()
+    np.testing.assert_allclose(_point_colours(obj).sum(1).argsort()[-1], first.sum(1).argsort()[-1])
+
+
+def test_confidence_wants_a_bake_to_vertices_that_fits(make, settings, refused):
+    obj = make()
+    assert "has not been baked" in refused(bpy.ops.neural_gash.show_confidence)
+    bpy.ops.neural_gash.bake()
+    obj.data.vertices[0].co.z += 0.5
+    obj.data.update()
+    bpy.context.view_layer.update()
+    assert "has changed since the bake" in refused(bpy.ops.neural_gash.show_confidence)
+    settings.target, settings.side = "TEXTURE", 32
+    bpy.ops.neural_gash.bake()
+    assert "bakes to vertices" in refused(bpy.ops.neural_gash.show_confidence)
+    assert ERRORS not in obj.data.attributes
