@@ -123,7 +123,7 @@ def columns(rng: Rng, target: int) -> Mesh:
 
 
 def furniture(rng: Rng) -> tuple[str, list[Mesh]]:
-    """The parts of a table, chair, shelf, lamp, cupboard or sofa that stands on z = 0, about 1 wide; and which it is."""
+    """Which of table, chair, shelf, lamp, cupboard or sofa it is, and its parts: stands on z = 0, about 1 wide."""
     kind = str(rng.choice(["table", "chair", "shelf", "lamp", "cupboard", "sofa"]))
     if kind in ("table", "chair"):
         high, leg = (0.7, 0.06) if kind == "table" else (0.45, 0.05)

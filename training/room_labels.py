@@ -37,8 +37,9 @@ TRAIN_RAYS, VALIDATION_RAYS = 512, irradiance.RAYS
 POINTS, QUERIES = 4096, 4096
 KEYS = ("scene_points", "queries", "irradiance", "noise", "seed", "split")
 _FIRST = {TRAIN: 0, VALIDATION: 1_000_000}  # seeds: no room is in both
-_SIGHT = 0.02          # metres that a visible point sees, at least, in one of LOOKS directions
+_SIGHT = 0.02          # metres that a visible point sees, at least, in some of LOOKS directions
 _LOOKS = 16
+_SEEING = 2            # of them at least: one in a slit may just graze along it
 
 
 @dataclass(frozen=True)
@@ -77,8 +78,8 @@ def jobs(count: int, split: str, rays: int, points: int = POINTS, queries: int =
 def visible_points(scene: LitScene, count: int, seed: int, occluders: Occluders) -> NDArray[np.float32]:
     """Points spread at random by area over what can be seen: (count, 9) position, unit normal, albedo.
 
-    A point is seen where one of its rays goes on a little, and meets no back: not sealed between things that touch,
-    not within a solid. Fewer where hardly any is.
+    A point is seen where some of its rays go on a little and then meet a front: not sealed between things that touch,
+    not within a solid, nor outside of the walls. Fewer where hardly any is.
     """
     rng = np.random.default_rng([seed, 9])
     cumulative = np.cumsum(scene.areas)
@@ -94,9 +95,9 @@ def visible_points(scene: LitScene, count: int, seed: int, occluders: Occluders)
         origins = occluders.origins(points, normals).repeat(_LOOKS, axis=0)
         near = occluders.blocked(origins, ways, np.full(len(ways), _SIGHT * occluders.scale, np.float32)) == 0
         hits = occluders.hits(origins, ways)
-        behind = np.zeros(len(ways), bool)
-        behind[hits.rays[~hits.front]] = True
-        seen = (~near & ~behind).reshape(count, _LOOKS).any(1)
+        met = np.zeros(len(ways), bool)
+        met[hits.rays[hits.front]] = True
+        seen = (met & ~near).reshape(count, _LOOKS).sum(1) >= _SEEING
         found.append(np.concatenate([points, normals, scene.albedo_at(faces, u, v)], 1)[seen].astype(np.float32))
         total += len(found[-1])
         if total >= count:

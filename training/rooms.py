@@ -265,8 +265,9 @@ def _bed(rng: Rng) -> list[Mesh]:
 
 def _desk_lamp(rng: Rng) -> tuple[list[Mesh], list[Mesh]]:
     """A standing ball on a foot: what it is made of, and what shines."""
-    high, radius = rng.uniform(0.2, 1.5), rng.uniform(0.06, 0.2)
-    return ([cylinder(0.12, 0.03, 20), cylinder(0.015, high, 8)], [place(ball(radius, 2), (0, 0, high + radius + _GAP))])
+    high, radius = rng.uniform(0.2, 1.5), rng.uniform(0.08, 0.2)
+    return ([cylinder(0.12, 0.03, 20), cylinder(0.015, high, 8)],
+            [place(ball(radius, 2), (0, 0, high + radius + _GAP))])
 
 
 def _piece(rng: Rng, files: Sequence[Path]) -> tuple[list[Mesh], list[Mesh]]:
@@ -279,15 +280,15 @@ def _piece(rng: Rng, files: Sequence[Path]) -> tuple[list[Mesh], list[Mesh]]:
     kind = rng.choice(["furniture", "bed", "boxes", "stack", "primitive", "lamp"], p=[0.58, 0.1, 0.12, 0.05, 0.1, 0.05])
     if kind == "furniture":
         which, parts = furniture(rng)
-        return parts, [place(ball(0.07, 2), (0, 0, 1.38))] if which == "lamp" else []
+        return parts, [place(ball(0.09, 2), (0, 0, 1.38))] if which == "lamp" else []
     if kind == "bed":
         return _bed(rng), []
     if kind == "lamp":
         return _desk_lamp(rng)
     if kind == "boxes":
         sizes = rng.uniform(0.2, 0.8, (int(rng.integers(1, 3)), 3))
-        heights = np.cumsum([0, *sizes[:, 2]])
-        return [box(s, (0, 0, low + s[2] / 2 + k * _GAP)) for k, (s, low) in enumerate(zip(sizes, heights, strict=False))], []
+        middles = np.cumsum(sizes[:, 2] + _GAP) - sizes[:, 2] / 2
+        return [box(size, (0, 0, middle)) for size, middle in zip(sizes, middles, strict=True)], []
     mesh = place(stack(rng, 0), scale=0.4) if kind == "stack" else any_primitive(rng, rng.uniform(0.2, 0.7))
     return [mesh], []
 
@@ -397,7 +398,7 @@ def generate(seed: int, files: Sequence[Path] = ()) -> LitScene:
     floor = sum((x1 - x0) * (y1 - y0) for r, _ in layout.rooms for x0, y0, x1, y1 in r)
     flux = floor * np.exp(rng.uniform(0, np.log(10)))  # 1 to 10 W to a square metre of floor
     tint = _tint(rng)
-    shares = rng.uniform(0.3, 1, len(shining))
+    shares = np.sqrt([area(mesh) for mesh in shining]) * rng.uniform(0.3, 1, len(shining))  # small ones give less
     for mesh, share in zip(shining, shares / shares.sum(), strict=True):
         own = tint if rng.random() < 0.7 else _tint(rng)
         parts.append(Part(mesh, np.full(3, 0.6), share * flux / (np.pi * area(mesh)) * own))

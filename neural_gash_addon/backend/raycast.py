@@ -102,7 +102,7 @@ class Occluders:
 
     def first(self, origins: NDArray[np.float32], directions: NDArray[np.float32]
               ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """As `hits`, of every ray: triangle (R,), -1 where there is none, u (R,), v (R,), its normal (R, 3), any length."""
+        """As `hits`, of every ray: triangle (R,), -1 where it meets none, u and v (R,), its normal (R, 3), not unit."""
         found = self._scene.run(origins, directions, query="INTERSECT", output=True)
         faces = self._first[found["geomID"]] + found["primID"]  # nothing is -1 and -1, and the last row holds 0
         return faces, found["u"], found["v"], found["Ng"]

