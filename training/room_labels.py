@@ -32,11 +32,11 @@ from . import data, rooms
 
 VERSION = 1            # raised whenever the same job gives other labels
 CACHE = data.CACHE / "rooms"
-TRAIN, VALIDATION = "train", "validation"
+TRAIN, VALIDATION, EVALUATION = "train", "validation", "evaluation"
 TRAIN_RAYS, VALIDATION_RAYS = 512, irradiance.RAYS
 POINTS, QUERIES = 4096, 4096
 KEYS = ("scene_points", "queries", "irradiance", "noise", "seed", "split")
-_FIRST = {TRAIN: 0, VALIDATION: 1_000_000}  # seeds: no room is in both
+_FIRST = {TRAIN: 0, VALIDATION: 1_000_000, EVALUATION: 2_000_000}  # seeds: no room is in two of them
 _SIGHT = 0.02          # metres that a visible point sees, at least, in some of LOOKS directions
 _LOOKS = 16
 _SEEING = 2            # of them at least: one in a slit may just graze along it
@@ -44,7 +44,7 @@ _SEEING = 2            # of them at least: one in a slit may just graze along it
 
 @dataclass(frozen=True)
 class Job:
-    """A room to label."""
+    """A room to label: of a seed; of the split EVALUATION, a scene in a file or else the Cornell box."""
 
     seed: int
     split: str
@@ -52,11 +52,12 @@ class Job:
     points: int = POINTS
     queries: int = QUERIES
     files: tuple[Path, ...] = ()  # of meshes that may stand in it
+    source: Path | None = None    # the file of a scene that is not generated
 
     def file_name(self) -> str:
         """The split, the seed and a digest of all that the labels depend on."""
         parts = [VERSION, rooms.VERSION, self.seed, self.split, self.rays, self.points, self.queries,
-                 [path.name for path in self.files]]
+                 [path.name for path in self.files], *([self.source.name] if self.source else [])]
         return f"{self.split}-{self.seed:07d}-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]}.npz"
 
 
@@ -73,6 +74,20 @@ def jobs(count: int, split: str, rays: int, points: int = POINTS, queries: int =
     """The first rooms of a split."""
     first = _FIRST[split]
     return [Job(seed, split, rays, points, queries, tuple(files)) for seed in range(first, first + count)]
+
+
+def evaluation(folder: Path | None, rays: int, points: int = POINTS, queries: int = QUERIES) -> list[Job]:
+    """The Cornell box, and the scenes of a folder, see `rooms.read`."""
+    sources = [None, *(sorted(folder.glob("*.npz")) if folder else [])]
+    return [Job(_FIRST[EVALUATION] + number, EVALUATION, rays, points, queries, source=source)
+            for number, source in enumerate(sources)]
+
+
+def scene_of(job: Job) -> LitScene:
+    """The scene of a job. Raises UserError where a file holds none."""
+    if job.source is not None:
+        return rooms.read(job.source)
+    return rooms.cornell_box() if job.split == EVALUATION else rooms.generate(job.seed, job.files)
 
 
 def visible_points(scene: LitScene, count: int, seed: int, occluders: Occluders) -> NDArray[np.float32]:
@@ -126,8 +141,8 @@ def work(job: Job, path: Path) -> Outcome:
     """Make, label and write one room. What is wrong with it is told of, not raised."""
     began = time.perf_counter()
     try:
-        scene = rooms.generate(job.seed, job.files)
-        found = label(scene, seed=job.seed, split=job.split, rays=job.rays, points=job.points, queries=job.queries)
+        found = label(scene_of(job), seed=job.seed, split=job.split, rays=job.rays, points=job.points,
+                      queries=job.queries)
     except UserError as error:
         return Outcome(job, time.perf_counter() - began, str(error))
     write_npz(path, **found)
@@ -171,12 +186,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--points", type=int, default=POINTS, help="scene points of a room")
     parser.add_argument("--queries", type=int, default=QUERIES, help="points of a room at which the light is known")
     parser.add_argument("--meshes", type=Path, help="folder of meshes that may stand in the rooms")
+    parser.add_argument("--scenes", type=Path, help="folder of scenes to evaluate with, beside the Cornell box")
     parser.add_argument("--cache", type=Path, default=CACHE)
     parser.add_argument("--workers", type=int, default=2, help="processes")
     options = parser.parse_args(arguments)
     files = sorted(p for p in options.meshes.glob("*") if p.suffix in data.SUFFIXES) if options.meshes else []
     wanted = [*jobs(options.rooms, TRAIN, options.rays, options.points, options.queries, files),
-              *jobs(options.validation, VALIDATION, options.validation_rays, options.points, options.queries, files)]
+              *jobs(options.validation, VALIDATION, options.validation_rays, options.points, options.queries, files),
+              *evaluation(options.scenes, options.validation_rays, options.points, options.queries)]
     paths, done = prepare(wanted, options.cache, options.workers)
     if done:
         seconds = sum(outcome.seconds for outcome in done)

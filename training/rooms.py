@@ -411,6 +411,21 @@ def _quad(corners: Sequence[Sequence[float]]) -> Mesh:
     return np.stack([0.556 - x, z, y], 1), np.array([[0, 1, 2], [0, 2, 3]], np.int32)
 
 
+def read(path: Path) -> LitScene:
+    """A scene of an .npz as in ../shared/meshes/scenes: verts, faces, face_albedo, face_emission, and which axis is up.
+
+    Turned so that Z is up. One that is larger than 100 is in millimetres.
+    """
+    with np.load(path, allow_pickle=False) as found:
+        positions, up = found["verts"].astype(float), str(found["up"])
+        triangles, albedo, emission = (found[key] for key in ("faces", "face_albedo", "face_emission"))
+    if up == "y":
+        positions = positions[:, [0, 2, 1]] * [-1, 1, 1]
+    if np.ptp(positions, axis=0).max() > 100:
+        positions = positions / 1000
+    return LitScene(positions, triangles.astype(np.int32), np.clip(albedo.astype(float), 0, 1), emission.astype(float))
+
+
 def cornell_box() -> LitScene:
     """The Cornell box from its published measurements (Cornell University Program of Computer Graphics, 1998, 2005).
 

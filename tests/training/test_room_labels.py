@@ -89,4 +89,25 @@ def test_points_that_nobody_sees_are_not_asked():
 def test_the_command(tmp_path, capsys):
     assert room_labels.main(["--rooms", "1", "--validation", "1", "--rays", "16", "--validation-rays", "16", "--points",
                              "32", "--queries", "16", "--cache", str(tmp_path), "--workers", "0"]) == 0
-    assert "2 of 2" in capsys.readouterr().out and len(list(tmp_path.glob("*.npz"))) == 2
+    assert "3 of 3" in capsys.readouterr().out
+    found = [load(path) for path in sorted(tmp_path.glob("*.npz"))]
+    assert sorted(str(each["split"]) for each in found) == ["evaluation", "train", "validation"]
+
+
+def test_scenes_of_files_are_labelled(meshes):
+    jobs = room_labels.evaluation(meshes / "scenes", 64, 512, 256)
+    assert len(jobs) == 4
+    for job in jobs:
+        scene = room_labels.scene_of(job)
+        assert np.ptp(scene.positions, axis=0).max() < rooms.LARGEST
+        found = room_labels.label(scene, seed=job.seed, split=job.split, rays=job.rays, points=job.points,
+                                  queries=job.queries)
+        assert found["queries"].shape == (256, 9) and np.isfinite(found["irradiance"]).all()
+        assert (found["irradiance"].max(1) > 0).mean() > 0.5, job  # lit, and asked on the sides that light reaches
+    ours, theirs = (room_labels.scene_of(job) for job in jobs[:2])
+    points = np.array([[0.45, 0.3, 0], [0.1, 0.2, 0], [0.001, 0.3, 0.2], [0.28, 0.5592, 0.5]])
+    normals = np.array([[0, 0, 1], [0, 0, 1], [1, 0, 0], [0, -1, 0]])
+    low = theirs.positions.min(0)
+    one, other = (methods.run(irradiance.irradiance(scene, points + shift, normals, 8192)).values
+                  for scene, shift in ((ours, 0), (theirs, low)))
+    assert one == pytest.approx(other, rel=0.04)   # its light hangs half a millimetre lower
