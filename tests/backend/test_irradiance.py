@@ -139,11 +139,11 @@ def _on_sphere(rng, count):
                                                ((0.2, 0.1, -0.19), (0, 0, 1)), ((0.49, 0.3, -0.45), (-1, 0, 0))])
 def test_it_equals_a_slow_twin(point, normal):
     scene = textured_box()
-    expected, noise = brute_force(scene, np.array(point, float), np.array(normal, float), paths.DEPTH, 60_000,
+    expected, noise = brute_force(scene, np.array(point, float), np.array(normal, float), paths.DEPTH, 24_000,
                                   np.random.default_rng(1))
     found = run(scene, point, normal, 16384)
     assert np.abs(found.values[0] - expected).max() < 4 * np.hypot(noise, found.error[0]).max()
-    assert noise.max() < 0.06 * expected.max()
+    assert noise.max() < 0.1 * expected.max()
 
 
 def test_light_from_the_back_only_where_it_is_to_be():
