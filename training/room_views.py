@@ -21,9 +21,12 @@ from neural_gash_addon.backend.raycast import Occluders
 
 from . import room_labels, rooms
 
-FIELD = 75.0       # degrees across a picture
+FIELD = 75.0       # degrees across a picture, of a camera in a room
+CORNELL = np.array([0.278, -0.8, 0.273]), np.array([0.278, 0.0, 0.273]), 39.3  # as published: from, towards, field
 _CANDIDATES = 200  # of places for a camera
 _CLEAR = 0.3       # metres around it
+
+Camera = tuple[NDArray[np.float64], NDArray[np.float64], float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +50,12 @@ class View:
         return self.image(self.queries[:, 6:] * light / np.pi + self.emission)
 
 
-def view(scene: LitScene, eye: NDArray, target: NDArray, width: int, height: int, occluders: Occluders) -> View:
-    """What is seen from a place (3,) towards another (3,), Z up."""
+def view(scene: LitScene, eye: NDArray, target: NDArray, field: float, width: int, height: int, occluders: Occluders
+         ) -> View:
+    """What is seen from a place (3,) towards another (3,), Z up; field: degrees from left to right."""
     forwards = unit(np.subtract(target, eye))
     right = unit(np.cross(forwards, [0.0, 0, 1]))
-    across = np.tan(np.radians(FIELD) / 2)
+    across = np.tan(np.radians(field) / 2)
     x, y = np.meshgrid((np.arange(width) + 0.5) / width * 2 - 1, 1 - (np.arange(height) + 0.5) / height * 2)
     ways = unit(forwards + across * (x[..., None] * right + height / width * y[..., None] * np.cross(right, forwards))
                 ).reshape(-1, 3)
@@ -68,8 +72,8 @@ def view(scene: LitScene, eye: NDArray, target: NDArray, width: int, height: int
     return View(width, height, hits.rays, queries.astype(np.float32), emission.astype(np.float32))
 
 
-def camera(scene: LitScene, seed: int, occluders: Occluders) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A place in a closed room at the height of eyes, clear of things, and what to look at: where it sees farthest."""
+def camera(scene: LitScene, seed: int, occluders: Occluders) -> Camera:
+    """A place in a closed room at the height of eyes, clear of things, and where it sees far, to look at; FIELD."""
     rng = np.random.default_rng([seed, 10])
     seen = room_labels.visible_points(scene, _CANDIDATES, seed, occluders).astype(float)
     offsets = seen[:, 3:6] * rng.uniform(0.3, 3.0, (len(seen), 1))
@@ -80,7 +84,7 @@ def camera(scene: LitScene, seed: int, occluders: Occluders) -> tuple[NDArray[np
     good = places[free & (np.abs(places[:, 2] - low - 0.65 * (high - low)) < 0.15 * (high - low))]
     angles = np.linspace(0, 2 * np.pi, 32, endpoint=False)
     around = np.stack([np.cos(angles), np.sin(angles), np.full(32, -0.15)], 1)
-    best, found = -1.0, (seen[0, :3], seen[1, :3])
+    best, found = -1.0, (seen[0, :3], seen[1, :3], FIELD)
     for place in good:
         hits = occluders.hits(occluders.origins(np.tile(place, (32, 1)), np.zeros((32, 3))), around.astype(np.float32))
         if len(hits.rays) < 32:
@@ -90,7 +94,7 @@ def camera(scene: LitScene, seed: int, occluders: Occluders) -> tuple[NDArray[np
         far = np.linalg.norm(met - place, axis=1)
         wide = sum(np.roll(far, k) for k in (-3, -2, -1, 0, 1, 2, 3))
         if far.min() > _CLEAR and wide.max() > best:
-            best, found = float(wide.max()), (place, met[int(wide.argmax())])
+            best, found = float(wide.max()), (place, met[int(wide.argmax())], FIELD)
     return found
 
 
@@ -101,11 +105,11 @@ def shown(image: NDArray) -> NDArray[np.float64]:
     return np.clip(1.25 * scaled / (1 + scaled), 0, 1) ** (1 / 2.2)
 
 
-def picture(scene: LitScene, seed: int, width: int, height: int, rays: int) -> tuple[NDArray, NDArray]:
+def picture(scene: LitScene, where: Camera, width: int, height: int, rays: int, occluders: Occluders
+            ) -> tuple[NDArray, NDArray]:
     """What a camera sees of a scene, and its irradiance: (height, width, 3) each; four points a pixel."""
-    occluders = scene.occluders()
-    seen = view(scene, *camera(scene, seed, occluders), 2 * width, 2 * height, occluders)
-    light = methods.run(irradiance.irradiance(scene, seen.queries[:, :3], seen.queries[:, 3:6], rays, seed=seed,
+    seen = view(scene, *where, 2 * width, 2 * height, occluders)
+    light = methods.run(irradiance.irradiance(scene, seen.queries[:, :3], seen.queries[:, 3:6], rays,
                                               occluders=occluders)).values
     both = seen.radiance(light), seen.image(light)
     return both[0].reshape(height, 2, width, 2, 3).mean((1, 3)), both[1].reshape(height, 2, width, 2, 3).mean((1, 3))
@@ -124,8 +128,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows = []
     for seed in options.seeds:
         scene = rooms.cornell_box() if seed < 0 else rooms.generate(seed)
-        rows.append(np.concatenate([shown(image) for image in picture(
-            scene, max(seed, 0), options.width, options.width * 3 // 4, options.rays)], axis=1))
+        occluders = scene.occluders()
+        where = CORNELL if seed < 0 else camera(scene, seed, occluders)
+        size = options.width, options.width * 3 // 4
+        rows.append(np.concatenate([shown(image) for image in picture(scene, where, *size, options.rays, occluders)],
+                                   axis=1))
     options.out.parent.mkdir(parents=True, exist_ok=True)
     imsave(options.out, np.concatenate(rows))
     return 0
