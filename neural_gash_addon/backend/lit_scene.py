@@ -69,26 +69,30 @@ class LitScene:
         return np.flatnonzero((self.emission > 0).any(1) & (self.areas > 0))
 
     @cached_property
-    def _placed(self) -> list[tuple[Picture, NDArray[np.int64], NDArray[np.int64]]]:
-        """The pictures of albedo, their row of each triangle (F,), -1 where it has none, and the columns to take."""
-        found = []
-        for picture in self.pictures:
-            columns = np.flatnonzero(picture.columns < 3)
-            if len(columns):
-                row = np.full(len(self.triangles), -1)
-                row[picture.triangles] = np.arange(len(picture.triangles))
-                found.append((picture, row, columns))
-        return found
+    def _coloured(self) -> tuple[list[tuple[Picture, NDArray[np.int64]]], NDArray[np.int16], NDArray[np.int64]]:
+        """Pictures of albedo and their columns that say it; each triangle's picture, -1: none, and row in it (F,)."""
+        found = [(picture, np.flatnonzero(picture.columns < 3)) for picture in self.pictures]
+        found = [(picture, columns) for picture, columns in found if len(columns)]
+        number, row = np.full(len(self.triangles), -1, np.int16), np.zeros(len(self.triangles), np.int64)
+        for index, (picture, _) in enumerate(found):
+            number[picture.triangles] = index
+            row[picture.triangles] = np.arange(len(picture.triangles))
+        return found, number, row
 
     def albedo_at(self, faces: NDArray[np.int64], u: NDArray, v: NDArray) -> NDArray[np.float32]:
         """(n, 3) at barycentric coordinates u, v (n,) of some triangles (n,), as `raycast.Hits` has them."""
-        out = self._albedo32[faces]
-        for picture, row, columns in self._placed:
-            rows = row[faces]
-            here = np.flatnonzero(rows >= 0)
+        out = self._albedo32.take(faces, 0)
+        pictures, number, row = self._coloured
+        if not pictures:
+            return out
+        numbers = number.take(faces)
+        order = np.argsort(numbers, kind="stable")  # NumPy sorts 16 bits by radix
+        ends = np.searchsorted(numbers.take(order), np.arange(len(pictures) + 1))
+        for (picture, columns), start, stop in zip(pictures, ends[:-1], ends[1:], strict=True):
+            here = order[start:stop]
             if len(here):
                 places = np.stack([1 - u[here] - v[here], u[here], v[here]], 1)
-                out[here[:, None], picture.columns[columns]] = picture.at(rows[here], places)[:, columns]
+                out[here[:, None], picture.columns[columns]] = picture.at(row[faces[here]], places)[:, columns]
         return out
 
     @cached_property
