@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from neural_gash_addon.backend import irradiance, methods
-from training import room_labels, rooms
+from training import floor_plans, room_labels, rooms
 
 SMALL = dict(points=64, queries=48)
 
@@ -99,7 +99,7 @@ def test_scenes_of_files_are_labelled(meshes):
     assert len(jobs) == 4
     for job in jobs:
         scene = room_labels.scene_of(job)
-        assert np.ptp(scene.positions, axis=0).max() < rooms.LARGEST
+        assert np.ptp(scene.positions, axis=0).max() < floor_plans.LARGEST
         found = room_labels.label(scene, seed=job.seed, split=job.split, rays=job.rays, points=job.points,
                                   queries=job.queries)
         assert found["queries"].shape == (256, 9) and np.isfinite(found["irradiance"]).all()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from neural_gash_addon.backend import irradiance, methods
-from training import room_labels, rooms
+from training import floor_plans, room_labels, rooms, solids
 
 SEEDS = range(20)
 
@@ -17,8 +17,8 @@ def some():
 def test_the_shell_is_closed_and_faces_inwards():
     boxes = [np.array([(0, 0, 0), (3, 4, 2.5)]), np.array([(3, 1, 0), (5, 2, 2.5)]),
              np.array([(0.5, 4, 0), (1.5, 4.2, 2)]), np.array([(-1, 4.2, 0), (2, 7, 2.2)])]
-    faces = rooms.shell(boxes)
-    positions, triangles = rooms.merge(list(faces.values()))
+    faces = floor_plans.shell(boxes)
+    positions, triangles = solids.merge(list(faces.values()))
     corners = positions[triangles]
     volume = np.einsum("fx,fx->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
     assert -volume == pytest.approx(sum(np.prod(high - low) for low, high in boxes))  # the boxes only touch
@@ -26,13 +26,13 @@ def test_the_shell_is_closed_and_faces_inwards():
     ends = np.stack([corners, np.roll(corners, -1, 1)], 2).reshape(-1, 6).round(9)
     there = {tuple(e) for e in ends}
     assert len(there) == len(ends) and there == {(*e[3:], *e[:3]) for e in ends}
-    floor = sum(rooms.area(mesh) for (_, axis, up), mesh in faces.items() if axis == 2 and up)
+    floor = sum(solids.area(mesh) for (_, axis, up), mesh in faces.items() if axis == 2 and up)
     assert floor == pytest.approx(12 + 2 + 0.2 + 8.4)
 
 
 def test_rooms_are_closed_and_lit(some):
     for seed, scene in zip(SEEDS, some, strict=True):
-        assert len(scene.emitters) and np.ptp(scene.positions, axis=0).max() <= rooms.LARGEST
+        assert len(scene.emitters) and np.ptp(scene.positions, axis=0).max() <= floor_plans.LARGEST
         occluders = scene.occluders()
         asked = room_labels.visible_points(scene, 200, seed, occluders)
         assert len(asked) == 200
@@ -45,7 +45,7 @@ def test_rooms_are_closed_and_lit(some):
 
 
 def test_rooms_are_of_many_kinds(some):
-    plans = [rooms.plan(np.random.default_rng(seed)) for seed in range(200)]
+    plans = [floor_plans.plan(np.random.default_rng(seed)) for seed in range(200)]
     count = np.bincount([len(p.rooms) for p in plans], minlength=4)
     assert (count[1:] > 15).all() and not count[0]
     assert 0.2 < np.mean([any(len(r) > 1 for r, _ in p.rooms) for p in plans]) < 0.8
