@@ -166,18 +166,36 @@ def mitsuba_irradiance(mi, scene, asked):
     return values.mean(1), values.std(1, ddof=1) / REPEATS ** 0.5
 
 
+def not_emitting(scene, asked, occluders):
+    """Those of points (N, 9) that show a meter no light of their own, and are not so dark as to amplify its noise."""
+    below = occluders.hits(occluders.origins(asked[:, :3] + 1e-4 * asked[:, 3:6], asked[:, 3:6]),
+                           np.ascontiguousarray(-asked[:, 3:6]))
+    return asked[below.rays][~scene.emission[below.faces].any(1) & (asked[below.rays, 6:].min(1) > 0.04)]
+
+
+def test_light_in_the_cornell_box_agrees_with_mitsuba():
+    """Little noise there: a bias of half a per cent would be seen."""
+    mi = pytest.importorskip("mitsuba", reason="needs mitsuba, a development dependency, as an independent renderer")
+    mi.set_variant("scalar_rgb")
+    scene = rooms.cornell_box()
+    occluders = scene.occluders()
+    asked = not_emitting(scene, room_labels.visible_points(scene, 80, 0, occluders), occluders)
+    expected, noise = mitsuba_irradiance(mi, scene, asked)
+    found = methods.run(irradiance.irradiance(scene, asked[:, :3], asked[:, 3:6], 16384, occluders=occluders))
+    sigma = np.hypot(np.maximum(noise, 0.5 * np.median(noise / expected) * expected), found.error)
+    assert np.sqrt(np.mean(((found.values - expected) / sigma) ** 2)) < 1.4  # 1.1 was seen
+    total = np.sqrt(np.square(sigma).sum(0)) / expected.sum(0)
+    assert total.max() < 2e-3
+    assert found.values.sum(0) / expected.sum(0) == pytest.approx(1, abs=4 * total.max())
+
+
 @pytest.mark.parametrize("seed", [0, 5, 10])
 def test_light_in_rooms_agrees_with_mitsuba(seed):
     mi = pytest.importorskip("mitsuba", reason="needs mitsuba, a development dependency, as an independent renderer")
     mi.set_variant("scalar_rgb")
     scene = rooms.generate(seed)
     occluders = scene.occluders()
-    asked = room_labels.visible_points(scene, 4 * POINTS, seed, occluders)
-    # points that emit show their own light to a meter, and dark texels amplify its noise
-    own = occluders.hits(occluders.origins(asked[:, :3] + 1e-4 * asked[:, 3:6], asked[:, 3:6]),
-                                 np.ascontiguousarray(-asked[:, 3:6]))
-    emits = scene.emission[own.faces].any(1)
-    asked = asked[own.rays][~emits & (asked[own.rays, 6:].min(1) > 0.05)][:POINTS]
+    asked = not_emitting(scene, room_labels.visible_points(scene, 4 * POINTS, seed, occluders), occluders)[:POINTS]
     expected, noise = mitsuba_irradiance(mi, scene, asked)
     found = methods.run(irradiance.irradiance(scene, asked[:, :3], asked[:, 3:6], 8192, seed=seed))
     # four repeats tell a standard error to a third, so it is not taken below half of what is usual here
