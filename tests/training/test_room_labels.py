@@ -37,7 +37,6 @@ def test_a_file_holds_what_it_promises(tmp_path):
         asked = found["queries"]
         truth = methods.run(irradiance.irradiance(scene, asked[:, :3], asked[:, 3:6], 4096, seed=77))
         score = (found["irradiance"] - truth.values) / np.maximum(np.hypot(found["noise"], truth.error), 1e-6)
-        print(job.seed, np.median(np.abs(score)), (np.abs(score) < 6).mean(), np.median(score))
         assert np.median(np.abs(score)) < 1.2 and (np.abs(score) < 6).mean() > 0.97
     assert load(paths[0])["seed"] != load(paths[2])["seed"]
 
