@@ -23,8 +23,8 @@ from .workers import product, results
 SETS = 16
 MAX_RAYS = 4096
 RAYS_PER_JOB = 1 << 16  # about 15 ms of one thread: short enough to stop at once, long enough to be efficient
-# Directions up to which a job mixes points of all sets: with more, one matrix product for all points of a set is
-# quicker, with fewer, going from set to set is.
+# Directions up to which a job mixes points of all sets, if there are more rays than one job has: with more, one matrix
+# product for all points of a set is quicker, with fewer, not having to go from set to set is.
 _MIXED = 16
 
 _TURNED_AT_ONCE = 2048  # points rotated by one worker at a time
@@ -84,7 +84,7 @@ class BlockedEstimator:
         size = max(1, RAYS_PER_JOB // (stop - start))
         set_of_row = self._set_of_point[points]
         harmonics = self._harmonics(start, stop)
-        if stop - start <= _MIXED:
+        if stop - start <= _MIXED or len(points) * (stop - start) <= RAYS_PER_JOB:
             every = self._sets[:, start:stop].astype(np.float32)
             for part in np.array_split(np.arange(len(points)), -(-len(points) // size)):
                 yield part, (every, harmonics)
