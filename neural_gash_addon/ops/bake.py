@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import threading
 from collections.abc import Callable, Generator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -88,10 +89,10 @@ class Baking:
         except UserError as error:
             return self._fail(context, error)
         self._batch, self._worker = batch, self._worker_type(batch.baking)
-        self._timer = context.window_manager.event_timer_add(_TICK, window=context.window)
         context.window_manager.modal_handler_add(self)
         context.window_manager.progress_begin(0, 100)
-        state.start(self._worker)
+        timer = context.window_manager.event_timer_add(_TICK, window=context.window)
+        state.start(self._worker, partial(_give_back, context, timer))
         self._say(context)
         self._worker.start()
         return {"RUNNING_MODAL"}
@@ -110,7 +111,8 @@ class Baking:
             self._say(context)
             state.redraw(context)
             return {"RUNNING_MODAL"}
-        self._end(context)
+        state.stop()
+        state.redraw(context)
         if self._worker.results is None:
             return self._fail(context, self._worker.error or UserError("The bake was stopped."))
         try:
@@ -121,7 +123,8 @@ class Baking:
     def cancel(self, context: bpy.types.Context) -> None:
         """Stop without a trace; Blender calls it too, when the window or the file closes."""
         self._worker.cancel()
-        self._end(context)
+        state.stop()
+        state.redraw(context)
         self._undo(context)
 
     def _say(self, context: bpy.types.Context) -> None:
@@ -131,16 +134,6 @@ class Baking:
             what = names[0] if len(names) == 1 else f"{len(names)} objects"
             context.workspace.status_text_set(
                 f"Neural GASh: {self._doing} {what}, {100 * state.progress:.0f} %. Esc cancels")
-
-    def _end(self, context: bpy.types.Context) -> None:
-        """Give back timer, status line and progress."""
-        state.stop()
-        manager = context.window_manager
-        manager.event_timer_remove(self._timer)
-        manager.progress_end()
-        if context.workspace:
-            context.workspace.status_text_set(None)
-        state.redraw(context)
 
     def _fail(self, context: bpy.types.Context, error: Exception) -> set[str]:
         """Say why there is no bake, and leave everything as it was."""
@@ -158,6 +151,14 @@ class Baking:
             if outcome.sentence:
                 self.report({"WARNING"}, outcome.sentence)
         return {"FINISHED"}
+
+
+def _give_back(context: bpy.types.Context, timer: bpy.types.Timer) -> None:
+    """Timer, progress and status line of a bake that ended."""
+    context.window_manager.event_timer_remove(timer)
+    context.window_manager.progress_end()
+    if context.workspace:
+        context.workspace.status_text_set(None)
 
 
 def targets(context: bpy.types.Context) -> list[bpy.types.Object]:

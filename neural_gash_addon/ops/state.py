@@ -2,23 +2,28 @@
 """What the panel shows of a running bake. Lives with the program, not with the file."""
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import bpy
 
 running = False
 progress = 0.0
 _worker = None  # of the bake that runs; it has cancel()
+_give_back: Callable[[], None] | None = None  # what its operator has of the window: timer, progress, status line
 
 
-def start(worker) -> None:
+def start(worker, give_back: Callable[[], None]) -> None:
     """A bake begins."""
-    global running, progress, _worker
-    running, progress, _worker = True, 0.0, worker
+    global running, progress, _worker, _give_back
+    running, progress, _worker, _give_back = True, 0.0, worker, give_back
 
 
 def stop() -> None:
     """It ended, however."""
-    global running, _worker
-    running, _worker = False, None
+    global running, _worker, _give_back
+    if _give_back is not None:
+        _give_back()
+    running, _worker, _give_back = False, None, None
 
 
 def abandon() -> None:

@@ -85,6 +85,28 @@ def test_two_processes_share_the_work(moving, run, tmp_path):
         assert not np.array_equal(one["transfer"], other["transfer"])
 
 
+def test_a_worker_that_was_killed_is_gone_on_from(moving, run, tmp_path):
+    """Killed in the middle of an item: what was done is up to date, the rest is baked, every file is whole."""
+    worker = subprocess.Popen(command(*_many(moving, tmp_path)), cwd=ROOT, text=True, stdout=subprocess.PIPE,
+                              stderr=subprocess.DEVNULL)
+    done = [json.loads(worker.stdout.readline()) for _ in range(3)]
+    worker.kill()
+    rest = worker.communicate()[0]
+    done += [json.loads(line) for line in rest.splitlines() if line.endswith("}")]
+    assert worker.returncode != 0 and 3 <= len(done) < 8
+    again = run(*_many(moving, tmp_path))
+    assert again.returncode == 0 and not again.stderr
+    entries = {(e["file"], e["object"], e["frame"]): e["status"] for e in _lines(again)}
+    assert len(entries) == 8
+    known = {(e["file"], e["object"], e["frame"]) for e in done}
+    assert all(entries[item] == "up to date" for item in known)
+    assert sum(status == "baked" for status in entries.values()) in (8 - len(done), 7 - len(done))
+    for path in tmp_path.rglob("*.npz"):
+        if not path.name.startswith("."):  # a draft of the one that was killed
+            with np.load(path) as arrays:
+                assert np.isfinite(arrays["transfer"]).all()
+
+
 def test_what_is_up_to_date_is_left_alone(moving, run, tmp_path):
     """Baked again: another setting, another shape, a file or its state gone or damaged; else not."""
     files, out = [tmp_path / "a.blend"], tmp_path / "out"

@@ -21,10 +21,15 @@ import threading
 import time
 import traceback
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
 from mathutils import Euler
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from likeness import LARGEST, differences
+from moments import moments
 
 ID = "bl_ext.user_default.neural_gash"
 NAME = "Suzanne"
@@ -32,7 +37,7 @@ TAB = "Neural GASh"
 MANY_RAYS = 16384     # minutes of work: these bakes never end by themselves
 ESC_LIMIT = 0.25      # seconds from the key to the end of the operator
 GAP_LIMIT = 0.5       # seconds without a turn of the event loop; software GL draws the panel in this time too
-TIMEOUT = 500         # seconds for the whole session
+TIMEOUT = 560         # seconds for the whole session
 
 facts: dict = {}
 failures: list[str] = []
@@ -187,6 +192,10 @@ def session():
     yield from reopened()
     yield from textured()
     yield from deleted()
+    yield from moments(SimpleNamespace(**globals()))
+    if pictures is not None and shutil.which("import"):
+        facts["differences"] = {name: round(much, 3) for name, much in differences(pictures).items()}
+        expect(max(facts["differences"].values()) < LARGEST, "pictures_are_like_the_references")
 
 
 def build():
