@@ -23,7 +23,8 @@ def left_behind(s) -> dict:
                 for name in dir(bpy.app.handlers) if isinstance(getattr(bpy.app.handlers, name), list)}
     return {"handlers": {name: count for name, count in handlers.items() if count},
             "threads": sum(t.name.startswith("neural_gash") for t in threading.enumerate()),
-            "modal": sum(len(w.modal_operators) for w in bpy.context.window_manager.windows)}
+            # None: of a class that is gone; Blender drops it with the next event
+            "modal": sum(op is not None for w in bpy.context.window_manager.windows for op in w.modal_operators)}
 
 
 def long_bake(s, window=None) -> None:
