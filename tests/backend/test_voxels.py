@@ -12,9 +12,14 @@ from . import shapes
 MIXED = [shapes.torus(), shapes.cube(subdivisions=0), shapes.grid(2)]
 
 
+def dense(level):
+    """(x, y, z, 4) all of a level's voxels, without pages."""
+    return level.at(np.arange(np.prod(level.shape), dtype=np.int32)).view(np.float32).reshape(*level.shape, 4)
+
+
 def opened(level):
-    """(n, 4) area and area times normal of a level's voxels, in square units of the longest side."""
-    found = level.voxels.view(np.float32).reshape(-1, 4).astype(float)
+    """(x * y * z, 4) area and area times normal of a level's voxels, in square units of the longest side."""
+    found = dense(level).reshape(-1, 4).astype(float)
     return found / (1 - found[:, :1]) * level.size ** 2
 
 
@@ -53,7 +58,7 @@ def read_slowly(geometry, point, normal, frame):
     out = np.zeros((cones.STEPS, cones.CHANNELS, conformal.DIRECTION_COUNT))
     for step, distance in enumerate(1.7 / FINEST * np.sqrt(2) ** np.arange(cones.STEPS)):
         level = voxels.levels[step // 2]
-        grid = level.voxels.view(np.float32).reshape(*level.shape, 4)
+        grid = dense(level)
         for number, direction in enumerate(conformal.hemisphere_directions() @ frame.T):
             at = (point - voxels.low) / voxels.side + distance * direction
             cell = np.floor(at / level.size - level.low).astype(int)
