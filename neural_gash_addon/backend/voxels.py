@@ -194,9 +194,13 @@ def _levels(places: NDArray[np.float32], values: NDArray[np.float32], box: NDArr
         part, sums = sums, np.empty((4, len(at)), np.float32)
         for total, value in zip(sums, part, strict=True):
             total[:] = np.bincount(index, value, len(at))
-        voxels = np.zeros((len(filled), 4), np.float32)
-        voxels[at] = (sums * (np.float32(1 / size ** 2) / (1 + sums[0] * np.float32(1 / size ** 2)))).T
-        out.append(Level(voxels.view(np.complex128)[:, 0], pages, (x, y, z), np.full(3, float(low)), size))
+        found, scale = np.empty((len(at), 4), np.float32), np.float32(1 / size ** 2)
+        scale = scale / (1 + sums[0] * scale)
+        for column, total in zip(found.T, sums, strict=True):
+            np.multiply(total, scale, out=column)
+        voxels = np.zeros(len(filled), np.complex128)
+        voxels[at] = found.view(np.complex128)[:, 0]
+        out.append(Level(voxels, pages, (x, y, z), np.full(3, float(low)), size))
         index = (full.take((at >> _PAGE) - 1) << _PAGE) + (at & ((1 << _PAGE) - 1)).astype(np.int32)
         column = index // np.int32(z)
         row = column // np.int32(y)
