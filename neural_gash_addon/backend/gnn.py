@@ -42,14 +42,14 @@ def blocked(mesh: TriangleMesh, voxels: Pyramid, network: Network, order: int, r
     points, normals = mesh.points[rows], mesh.normals[rows]
     share = np.clip((normals[:, 1] - _BLEND[0]) / (_BLEND[1] - _BLEND[0]), 0, 1)
     share = share * share * (3 - 2 * share)  # of the frame whose pole is +e_y
+    one, two = np.flatnonzero(share < 1), np.flatnonzero(share > 0)
+    here = np.concatenate([one, two])  # read at once: a small mesh would wait for the calls of NumPy twice
+    frames = np.concatenate([frames_of(normals[one], over=False), frames_of(normals[two], over=True)])
+    local = answer(cones.read(voxels, points[here], normals[here], frames), network)[:, :order * order]
+    turned = np.concatenate([1 - share[one], share[two]])[:, None] * sh.rotate_each(local, frames)
     out = np.zeros((len(rows), order * order), np.float32)
-    for over, weight in ((False, 1 - share), (True, share)):
-        here = np.flatnonzero(weight > 0)
-        if not len(here):
-            continue
-        frames = frames_of(normals[here], over)
-        local = answer(cones.read(voxels, points[here], normals[here], frames), network)[:, :order * order]
-        out[here] += weight[here, None] * sh.rotate_each(local, frames)
+    out[one] = turned[:len(one)]
+    out[two] += turned[len(one):]
     return out
 
 
