@@ -3,8 +3,8 @@
 
 Source: the pre-filtered voxels of Crassin et al. 2011, "Interactive Indirect Illumination Using Voxel Cone
 Tracing", without octree: what cones (`cones`) read lies within a small box, so each level is a plain array, of whose
-pages only those are kept that have something in them. (Left to the operating system, whose pages are a hundred times as
-large and cleared when they are first written to, that took most of the time of a small mesh.)
+pages only those are kept that have something in them. (The operating system's pages would do, but they are thirty times
+as large or more, and to have them cleared took most of the time of a small mesh.)
 
 Lengths are in units of the longest side of what is baked, from just below the low corner of its box.
 """
@@ -124,7 +124,7 @@ def _samples(triangles: NDArray, size: NDArray) -> tuple[NDArray[np.float32], ND
     of = np.repeat(np.arange(len(many)), count)
     number = np.arange(len(of), dtype=np.uint32) - (np.cumsum(count) - count).astype(np.uint32).take(of)
     # a lattice of the unit square, folded into the triangle by the root that keeps areas
-    root = (number + np.float32(0.5)) * (1 / count).astype(np.float32).take(of)
+    root = (number.astype(np.float32) + np.float32(0.5)) * (1 / count).astype(np.float32).take(of)
     np.sqrt(root, out=root)
     along = (number * _GOLDEN + np.uint32(1 << 31)).astype(np.float32)  # the product's overflow is what wraps it
     along *= np.float32(2.0 ** -32)
