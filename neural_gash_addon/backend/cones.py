@@ -75,5 +75,5 @@ def _at(level: Level, places: NDArray, along: NDArray[np.float32], distance: flo
     for axis in (1, 2):
         index *= np.int32(level.shape[axis])
         index += cell[axis]
-    found = level.voxels.take(index.ravel(), mode="clip").view(np.float32)
+    found = level.at(index.ravel()).view(np.float32)
     return np.ascontiguousarray(found.reshape(-1, 4).T).reshape(4, *index.shape)

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from . import cones, conformal
 from . import spherical_harmonics as sh
-from .conformal import DIRECTION_COUNT
 from .geometry import TriangleMesh
 from .voxels import Pyramid
 from .workers import BLAS_SERIAL
@@ -42,14 +41,14 @@ def blocked(mesh: TriangleMesh, voxels: Pyramid, network: Network, order: int, r
     points, normals = mesh.points[rows], mesh.normals[rows]
     share = np.clip((normals[:, 1] - _BLEND[0]) / (_BLEND[1] - _BLEND[0]), 0, 1)
     share = share * share * (3 - 2 * share)  # of the frame whose pole is +e_y
+    one, two = np.flatnonzero(share < 1), np.flatnonzero(share > 0)
+    here = np.concatenate([one, two])  # read at once: a small mesh would wait for the calls of NumPy twice
+    frames = np.concatenate([frames_of(normals[one], over=False), frames_of(normals[two], over=True)])
+    local = answer(cones.read(voxels, points[here], normals[here], frames), network)[:, :order * order]
+    turned = np.concatenate([1 - share[one], share[two]])[:, None] * sh.rotate_each(local, frames)
     out = np.zeros((len(rows), order * order), np.float32)
-    for over, weight in ((False, 1 - share), (True, share)):
-        here = np.flatnonzero(weight > 0)
-        if not len(here):
-            continue
-        frames = frames_of(normals[here], over)
-        local = answer(cones.read(voxels, points[here], normals[here], frames), network)[:, :order * order]
-        out[here] += weight[here, None] * sh.rotate_each(local, frames)
+    out[one] = turned[:len(one)]
+    out[two] += turned[len(one):]
     return out
 
 
@@ -63,14 +62,21 @@ def frames_of(normals: NDArray, over: bool) -> NDArray[np.float64]:
 
 def answer(seen: NDArray[np.float32], network: Network) -> NDArray[np.float32]:
     """The blocked part (n, ORDER**2) in the frames in which `seen` (F, 25, n) was read."""
-    features, _, count = seen.shape
-    now = _product(network["cone.0.weight"], seen.reshape(features, -1)).reshape(-1, DIRECTION_COUNT, count)
-    now += (network["direction"] + network["cone.0.bias"]).T[:, :, None]
+    features, directions, count = seen.shape
+    bias = (network["direction"] + network["cone.0.bias"]).T  # (units, 25)
+    now = _product(network["cone.0.weight"], seen.reshape(features, -1)).reshape(-1, directions, count)
+    # max(x + b, 0) is max(x, -b) + b, and that b goes into the next layer's: a pass less over the most numbers
+    np.maximum(now, -bias[:, :, None], out=now)
+    bias = network["cone.1.weight"] @ bias + network["cone.1.bias"][:, None]
+    now = _product(network["cone.1.weight"], now.reshape(len(now), -1)).reshape(-1, directions, count)
+    np.maximum(now, -bias[:, :, None], out=now)
+    # einsum, because BLAS would spread so small a product over threads of its own
+    bias = np.einsum("ij,j->i", network["point.0.weight"], bias.ravel()) + network["point.0.bias"]
+    now = _product(network["point.0.weight"], now.reshape(-1, count))  # of each unit of stage 1, all directions
+    now += bias[:, None]
     np.maximum(now, 0, out=now)
-    now = _rectified(network, "cone.1", now.reshape(len(now), -1))
-    now = now.reshape(-1, count)  # of each unit of stage 1, all directions
-    now = _rectified(network, "point.0", now)
-    now = _rectified(network, "point.1", now)
+    now = _layer(network, "point.1", now)
+    np.maximum(now, 0, out=now)
     return _layer(network, "point.2", now).T
 
 
@@ -95,9 +101,3 @@ def _product(weight: NDArray[np.float32], values: NDArray[np.float32]) -> NDArra
                   out=parts[:, :, :whole].reshape(len(parts), rows, -1, columns).transpose(0, 2, 1, 3))
     np.matmul(tiles[:, 0], values[:, whole:], out=parts[:, :, whole:])
     return out
-
-
-def _rectified(network: Network, name: str, values: NDArray[np.float32]) -> NDArray[np.float32]:
-    out = _layer(network, name, values)
-    return np.maximum(out, 0, out=out)
-

@@ -2,8 +2,9 @@
 """Surfaces pooled into a pyramid of voxels: how much area lies in each, and which way it faces.
 
 Source: the pre-filtered voxels of Crassin et al. 2011, "Interactive Indirect Illumination Using Voxel Cone
-Tracing", without octree: what cones (`cones`) read lies within a small box, so each level is a plain array, and
-pages of it that nothing is written to cost nothing.
+Tracing", without octree: what cones (`cones`) read lies within a small box, so each level is a plain array, of whose
+pages only those are kept that have something in them. (The operating system's pages would do, but they are thirty times
+as large or more, and to have them cleared took most of the time of a small mesh.)
 
 Lengths are in units of the longest side of what is baked, from just below the low corner of its box.
 """
@@ -22,19 +23,27 @@ _DENSITY = 1.5    # samples of a surface for each face of a voxel that it would 
 # of a voxel, from the low corner of what is baked to that of its first voxel: people build on round coordinates, and a
 # wall that lay on a border of voxels would be on either side of it as floats are rounded
 _SHIFT = 0.37
-_GOLDEN = 0.6180339887498949
+_GOLDEN = np.uint32(2654435769)  # the golden ratio's fraction, of 2**32
+_PAGE = 3         # bits of the index that count within a page
 
 
 @dataclass(frozen=True, eq=False)
 class Level:
     """The voxels of one size, as far as they are read."""
 
-    # (x * y * z,) four float32 each: the area a in the voxel, in its faces, as a / (1 + a), and the sum of area times
-    # normal, over 1 + a, too. One item of 16 bytes, because NumPy gathers items faster than rows.
+    # (n,) four float32 each: the area a in the voxel, in its faces, as a / (1 + a), and the sum of area times normal,
+    # over 1 + a, too. One item of 16 bytes, because NumPy gathers items faster than rows.
     voxels: NDArray[np.complex128]
+    pages: NDArray[np.int32]  # of each eight of the shape's voxels, the index of the first; 0 where all are empty
     shape: tuple[int, int, int]
     low: NDArray[np.float64]  # (3,) index of the first voxel, counted from the low corner of what is baked
     size: float               # side of a voxel
+
+    def at(self, index: NDArray[np.int32]) -> NDArray[np.complex128]:
+        """The voxels at places of the shape, laid out flat; (n,) each."""
+        first = self.pages.take(index >> _PAGE, mode="clip")
+        first += index & ((1 << _PAGE) - 1)
+        return self.voxels.take(first, mode="clip")
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +80,7 @@ class Pyramid:
         cut = [(parts[0], np.zeros(1)), *(_near(part, box, reaches) for part in parts[1:])]
         # what is far is not pooled from finer voxels, and sampled more densely instead
         samples = [_samples(part, 2.0 ** np.maximum(level - 1, 0) / FINEST) for part, level in cut]
-        places, values = (np.concatenate(column, 1) for column in zip(*samples, strict=True))
+        places, values = (_joined(column) for column in zip(*samples, strict=True))
         return Pyramid(_levels(places, values, box, reaches), low, side)
 
 
@@ -97,7 +106,7 @@ def _near(triangles: NDArray, box: NDArray, reaches: Sequence[float]) -> tuple[N
     return np.concatenate(done, 2), np.concatenate(levels)
 
 
-def _samples(triangles: NDArray, size: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+def _samples(triangles: NDArray, size: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Places (3, n) spread over triangles (3, 3, m), dense enough for voxels of `size` (m,); and what each stands for:
     (4, n) area and area times normal.
     """
@@ -109,51 +118,92 @@ def _samples(triangles: NDArray, size: NDArray) -> tuple[NDArray[np.float64], ND
     longest = np.sqrt(np.maximum(np.maximum(_square(ab), _square(ac)), _square(c - b)))
     count = np.ceil(np.maximum(_DENSITY * area / size ** 2, longest / size)).astype(np.int64)
     count[~(area > 0)] = 0
-    value = np.stack([area, *normal]).astype(np.float32)
+    value = np.stack([area, *normal])
     one, many = np.flatnonzero(count == 1), np.flatnonzero(count > 1)  # most triangles of a dense mesh have one
     count = count[many]
-    of = np.repeat(many, count)
-    number = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
-    total = np.repeat(count, count)
+    of = np.repeat(np.arange(len(many)), count)
+    number = np.arange(len(of), dtype=np.uint32) - (np.cumsum(count) - count).astype(np.uint32).take(of)
     # a lattice of the unit square, folded into the triangle by the root that keeps areas
-    root, along = np.sqrt((number + 0.5) / total), np.modf(0.5 + _GOLDEN * number)[0]
-    places = a.take(of, 1) + root * (1 - along) * ab.take(of, 1) + root * along * ac.take(of, 1)
-    return (np.concatenate([(a + b + c).take(one, 1) / 3, places], 1),
-            np.concatenate([value.take(one, 1), value.take(of, 1) / total.astype(np.float32)], 1))
+    root = (number.astype(np.float32) + np.float32(0.5)) * (1 / count).astype(np.float32).take(of)
+    np.sqrt(root, out=root)
+    along = (number * _GOLDEN + np.uint32(1 << 31)).astype(np.float32)  # the product's overflow is what wraps it
+    along *= np.float32(2.0 ** -32)
+    along *= root
+    root -= along
+    places, values = (np.empty((rows, len(one) + len(of)), np.float32) for rows in (3, 4))
+    places[:, :len(one)] = (a + b + c).take(one, 1) / 3
+    values[:, :len(one)] = value.take(one, 1)
+    a, ab, ac = (corner.take(many, 1).astype(np.float32) for corner in (a, ab, ac))
+    for place, corner, first, second in zip(places[:, len(one):], a, ab, ac, strict=True):
+        corner.take(of, out=place, mode="clip")
+        place += root * first.take(of)
+        place += along * second.take(of)
+    for out, each in zip(values[:, len(one):], (value.take(many, 1) / count).astype(np.float32), strict=True):
+        each.take(of, out=out, mode="clip")
+    return places, values
+
+
+def _joined(parts: Sequence[NDArray]) -> NDArray:
+    """(rows, n) of all parts' columns; no copy of one alone: fresh memory takes as long as what is done with it."""
+    parts = [part for part in parts if part.shape[1]] or parts[:1]
+    return parts[0] if len(parts) == 1 else np.concatenate(parts, 1)
 
 
 def _square(vectors: NDArray) -> NDArray:
     return vectors[0] * vectors[0] + vectors[1] * vectors[1] + vectors[2] * vectors[2]
 
 
-def _levels(places: NDArray, values: NDArray[np.float32], box: NDArray, reaches: Sequence[float]) -> list[Level]:
+def _levels(places: NDArray[np.float32], values: NDArray[np.float32], box: NDArray, reaches: Sequence[float]
+            ) -> list[Level]:
     """Add samples (3, n) with values (4, n) up in all levels, each from the one below and from what that had not."""
     out = []
-    cells, sums = np.zeros((3, 0), np.int64), values[:, :0]
+    cells, sums = np.zeros((3, 0), np.int32), values[:, :0]  # indices counted from the low corner of what is baked
     for number, reach in enumerate(reaches):
         size = 2.0 ** number / FINEST
-        if places.shape[1]:
-            x, y, z = ((place >= -reach) & (place <= most + reach) for place, most in zip(places, box, strict=True))
-            inside = x & y & z
-            whole = bool(inside.all())
-            here = places if whole else places[:, inside]
-            cells = np.concatenate([cells, np.floor(here / size).astype(np.int64)], 1)
-            sums = np.concatenate([sums, values if whole else values[:, inside]], 1)
-            places, values = (places[:, :0], values[:, :0]) if whole else (places[:, ~inside], values[:, ~inside])
-        low = np.full(3, int(np.floor(-reach / size)))
+        low = int(np.floor(-reach / size))
         shape = np.floor((box + reach) / size).astype(np.int64) + 1 - low
-        index = ((cells[0] - low[0]) * shape[1] + cells[1] - low[1]) * shape[2] + cells[2] - low[2]
-        grid = np.zeros((int(shape.prod()), 4), np.float32)
-        filled = np.zeros(len(grid), bool)
-        filled[index] = True
-        full = np.flatnonzero(filled)
-        rank = np.empty(len(grid), np.int32)  # of each full voxel; pages that are not written to cost nothing
-        rank[full] = np.arange(len(full), dtype=np.int32)
-        index = rank[index]
-        sums = np.stack([np.bincount(index, value, len(full)) for value in sums]).astype(np.float32)
-        area = sums[0] * np.float32(1 / size ** 2)
-        grid[full] = (sums * (np.float32(1 / size ** 2) / (1 + area))).T
-        cells = (np.stack(np.unravel_index(full, tuple(shape))) + low[:, None]) >> 1
+        cells -= low
+        if places.shape[1]:
+            here = places * np.float32(1 / size)
+            np.floor(here, out=here)
+            here -= np.float32(low)
+            if here.min() < 0 or (here.max(1) >= shape).any():
+                inside = np.all((here >= 0) & (here < shape[:, None]), 0)
+                here, value = here[:, inside], values[:, inside]
+                places, values = places[:, ~inside], values[:, ~inside]
+            else:
+                value, places, values = values, places[:, :0], values[:, :0]
+            cells, sums = _joined([cells, here.astype(np.int32)]), _joined([sums, value])
         x, y, z = shape.tolist()
-        out.append(Level(grid.view(np.complex128)[:, 0], (x, y, z), low.astype(np.float64), size))
+        index = (cells[0] * np.int32(y) + cells[1]) * np.int32(z) + cells[2]
+        index = index.astype(np.intp)
+        page = index >> _PAGE
+        filled = np.zeros((x * y * z >> _PAGE) + 1, bool)
+        filled[page] = True
+        full = np.flatnonzero(filled).astype(np.int32)
+        pages = np.zeros(len(filled), np.int32)
+        pages[full] = np.arange(1, len(full) + 1, dtype=np.int32) << _PAGE
+        index &= (1 << _PAGE) - 1
+        index += pages.take(page)
+        filled = np.zeros((len(full) + 1) << _PAGE, bool)
+        filled[index] = True
+        at = np.flatnonzero(filled)
+        rank = np.empty(len(filled), np.intp)
+        rank[at] = np.arange(len(at))
+        index = rank.take(index)
+        part, sums = sums, np.empty((4, len(at)), np.float32)
+        for total, value in zip(sums, part, strict=True):
+            total[:] = np.bincount(index, value, len(at))
+        found, scale = np.empty((len(at), 4), np.float32), np.float32(1 / size ** 2)
+        scale = scale / (1 + sums[0] * scale)
+        for column, total in zip(found.T, sums, strict=True):
+            np.multiply(total, scale, out=column)
+        voxels = np.zeros(len(filled), np.complex128)
+        voxels[at] = found.view(np.complex128)[:, 0]
+        out.append(Level(voxels, pages, (x, y, z), np.full(3, float(low)), size))
+        index = (full.take((at >> _PAGE) - 1) << _PAGE) + (at & ((1 << _PAGE) - 1)).astype(np.int32)
+        column = index // np.int32(z)
+        row = column // np.int32(y)
+        cells = np.stack([row, column - row * np.int32(y), index - column * np.int32(z)])
+        cells = (cells + low) >> 1
     return out

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from neural_gash_addon.backend import cones, conformal, gnn
+from neural_gash_addon.backend import voxels as pooling
 from neural_gash_addon.backend.voxels import FINEST, Pyramid
 
 from . import shapes
@@ -12,9 +13,14 @@ from . import shapes
 MIXED = [shapes.torus(), shapes.cube(subdivisions=0), shapes.grid(2)]
 
 
+def dense(level):
+    """(x, y, z, 4) all of a level's voxels, without pages."""
+    return level.at(np.arange(np.prod(level.shape), dtype=np.int32)).view(np.float32).reshape(*level.shape, 4)
+
+
 def opened(level):
-    """(n, 4) area and area times normal of a level's voxels, in square units of the longest side."""
-    found = level.voxels.view(np.float32).reshape(-1, 4).astype(float)
+    """(x * y * z, 4) area and area times normal of a level's voxels, in square units of the longest side."""
+    found = dense(level).reshape(-1, 4).astype(float)
     return found / (1 - found[:, :1]) * level.size ** 2
 
 
@@ -47,13 +53,65 @@ def test_a_wall_is_as_full_as_it_is_wide():
     np.testing.assert_allclose(inner[..., 3], inner[..., 0], rtol=1e-5)
 
 
+def pooled_slowly(geometry, finest, levels):
+    """Of each level, {voxel, counted from the low corner: (4,) area and area times normal}, sample by sample."""
+    positions, triangles = geometry
+    low, high = positions[triangles].min((0, 1)), positions[triangles].max((0, 1))
+    side = (high - low).max()
+    corners = (positions - low) / side * finest + 0.37  # voxels are counted from a little below
+    found = {}
+    for a, b, c in corners[triangles]:
+        normal = 0.5 * np.cross(b - a, c - a)
+        extent = np.linalg.norm(normal)
+        edge = max(np.linalg.norm(b - a), np.linalg.norm(c - a), np.linalg.norm(c - b))
+        count = int(np.ceil(max(1.5 * extent, edge)))
+        for number in range(count):
+            root, along = np.sqrt((number + 0.5) / count), (0.5 + number * (np.sqrt(5) - 1) / 2) % 1
+            place = (a + b + c) / 3 if count == 1 else a + root * ((1 - along) * (b - a) + along * (c - a))
+            key = tuple(np.floor(place).astype(int))
+            found[key] = found.get(key, 0) + np.array([extent, *normal]) / count
+    out = [found]
+    for _ in range(levels - 1):
+        coarser = {}
+        for (x, y, z), value in out[-1].items():
+            key = (x >> 1, y >> 1, z >> 1)
+            coarser[key] = coarser.get(key, 0) + value
+        out.append(coarser)
+    return out
+
+
+@pytest.mark.parametrize("geometry", [shapes.sphere(3), shapes.cube(subdivisions=0)],
+                         ids=["sphere", "twelve triangles"])
+def test_voxels_hold_what_the_slow_twin_puts_in_them(geometry, monkeypatch):
+    for module in (pooling, cones):
+        monkeypatch.setattr(module, "FINEST", 24)  # as the twin is slow
+    voxels = cones.pyramid([geometry])
+    for number, slow in enumerate(pooled_slowly(geometry, 24, len(voxels.levels))):
+        level = voxels.levels[number]
+        found = dense(level)
+        expected = np.zeros_like(found)
+        at = np.array(list(slow)) - level.low.astype(int)
+        summed = np.array(list(slow.values())) / 4 ** number  # in faces of this level's voxels
+        expected[tuple(at.T)] = summed / (1 + summed[:, :1])
+        differ = np.abs(found - expected).max(-1) > 1e-5
+        assert differ.sum() <= 3e-3 * len(slow)  # where float32 rounds a sample across a border
+
+
+def test_pages_without_anything_in_them_are_not_kept():
+    for level in cones.pyramid([shapes.torus()]).levels:
+        pages = level.voxels.reshape(-1, 8)
+        assert not pages[0].any()
+        assert pages[1:].any(1).all()
+        assert sorted(level.pages[level.pages > 0]) == list(range(8, len(level.voxels), 8))
+
+
 def read_slowly(geometry, point, normal, frame):
     """`cones.read` of one point from samples, voxel by voxel: (STEPS, CHANNELS, 25)."""
     voxels = cones.pyramid(geometry)
     out = np.zeros((cones.STEPS, cones.CHANNELS, conformal.DIRECTION_COUNT))
     for step, distance in enumerate(1.7 / FINEST * np.sqrt(2) ** np.arange(cones.STEPS)):
         level = voxels.levels[step // 2]
-        grid = level.voxels.view(np.float32).reshape(*level.shape, 4)
+        grid = dense(level)
         for number, direction in enumerate(conformal.hemisphere_directions() @ frame.T):
             at = (point - voxels.low) / voxels.side + distance * direction
             cell = np.floor(at / level.size - level.low).astype(int)
