@@ -27,6 +27,7 @@ _RAYS = (2, 4, 8, 16, 32, 64)
 # Errors below this are alike, and the plan that does most is taken: a mesh at rest may have no shadow at all, and then
 # says nothing of what the next pose needs.
 _ALIKE = 0.01
+_ATTEMPTS = 4  # before a plan is said to take too long: others than the one that is timed use the machine too
 _SAMPLE, _SAMPLE_RAYS = 512, 256  # points at which errors are measured
 
 
@@ -113,7 +114,9 @@ class Live:
                    and (t.rays or 0) <= (plan.rays or 0) for t in tried):
                 continue  # less of the same took too long
             took = np.inf
-            for _ in range(2):  # the first has caches to fill
+            for attempt in range(_ATTEMPTS):
+                if attempt > 1 and took <= seconds:  # the first has caches to fill
+                    break
                 began = time.perf_counter()
                 found = self.bake(mesh, occluders, plan)
                 took = min(took, time.perf_counter() - began)

@@ -28,9 +28,9 @@ from .frames import rotation_part
 from .lighting import light_object
 from .read import SELF, fingerprint, read_occluders, refusal, same_fingerprint
 
-_SLOW = 1.2      # an update also reads and writes, besides what its plan says
+_BESIDES = 0.15  # of the budget, for reading and writing, before any update has been timed
 _NEWEST = 0.2    # weight of the newest update in how slow updates are
-_ROOM = 0.7      # of the budget that a better plan must keep to, to be taken again: so that plans do not alternate
+_ROOM = 0.85     # of the budget that a better plan must keep to, to be taken again: so that plans do not alternate
 
 
 @dataclass(eq=False)
@@ -41,7 +41,8 @@ class _Follower:
     live: Live | None = None
     plans: list[LivePlan] = field(default_factory=list)
     plan: LivePlan | None = None
-    slow: float = _SLOW   # how many times as long an update takes as its plan took when it was tried
+    slow: float = 1.0     # how many times as long its plan takes as when it was tried
+    besides: float = 0.0  # seconds that an update takes besides: to read and to write
     order: int = 0
     budget: float = 0.0
     seconds: float = 0.0  # the last update took
@@ -171,8 +172,10 @@ def _update(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types.
     else:
         plan = _plan(scene, follower, mesh, occluders, before.order)
         assert follower.live is not None
+        reading = time.perf_counter() - began
         found = follower.live.bake(mesh, occluders, plan)
         took = time.perf_counter() - began
+        baked = took - reading
         transfer = Transfer(found, BakeRecord(
             method=plan.method, order=before.order, points=len(mesh.points), domain=mesh.domain,
             rays=(plan.rays or 0) * plan.points, seed=0, seconds=took, error_estimate=plan.error,
@@ -184,7 +187,7 @@ def _update(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types.
         light_object(scene, obj)
     follower.seconds = time.perf_counter() - began
     if not rendered:
-        _adapt(follower)
+        _adapt(follower, baked)
     return True
 
 
@@ -194,18 +197,21 @@ def _plan(scene: bpy.types.Scene, follower: _Follower, mesh: TriangleMesh, occlu
     if follower.live is None or follower.order != order or not follower.live.fits(mesh):
         follower.live, follower.order, follower.plan = Live(mesh, order), order, None
     if follower.plan is None or follower.budget != budget:
-        follower.plans = follower.live.tried(mesh, occluders, budget / _SLOW)
-        follower.plan, follower.budget, follower.slow = best(follower.plans, budget / _SLOW), budget, _SLOW
+        room = (1 - _BESIDES) * budget
+        follower.plans = follower.live.tried(mesh, occluders, room)
+        follower.plan, follower.budget = best(follower.plans, room), budget
+        follower.slow, follower.besides = 1.0, _BESIDES * budget
     return follower.plan
 
 
-def _adapt(follower: _Follower) -> None:
+def _adapt(follower: _Follower, baked: float) -> None:
     """Take another plan where updates turn out to be slower than the budget, or where there is room for a better one:
-    drawing takes its part of the machine, and so may other programs.
+    drawing takes its part of the machine, and so may other programs. baked: seconds of the update that its plan took.
     """
     assert follower.plan is not None
-    follower.slow += _NEWEST * (follower.seconds / follower.plan.seconds - follower.slow)
-    room = follower.budget / follower.slow
+    follower.slow += _NEWEST * (baked / follower.plan.seconds - follower.slow)
+    follower.besides += _NEWEST * (follower.seconds - baked - follower.besides)
+    room = (follower.budget - follower.besides) / follower.slow
     if follower.plan.seconds > room:
         follower.plan = best(follower.plans, room)
     else:

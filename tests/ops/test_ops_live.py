@@ -283,20 +283,21 @@ def test_disabled_while_live(wing, settings, addon):
 
 def test_slow_updates_take_a_lesser_plan_and_quick_ones_a_better():
     plans = [live.LivePlan("hybrid", rays, 0, 100, 0.001 * rays, 1 / rays) for rays in (2, 4, 8, 16)]
-    follower = live._Follower(plans=plans, plan=plans[3], budget=0.02)
+    follower = live._Follower(plans=plans, plan=plans[3], budget=0.02, besides=0.002)
 
     def updates(times):
         rays = []
         for _ in range(40):
-            follower.seconds = times * follower.plan.seconds
-            live._adapt(follower)
+            baked = times * follower.plan.seconds
+            follower.seconds = baked + 0.002  # to read and to write
+            live._adapt(follower, baked)
             rays.append(follower.plan.rays)
         return rays
 
     assert set(updates(1.1)) == {16}
-    slowed = updates(3.0)  # 16 rays take 48 ms now, and 4 take 12
+    slowed = updates(3.0)  # 16 rays take 48 ms now, and 4 take 12, of 18
     assert slowed[-1] == 4 and slowed == sorted(slowed, reverse=True)
-    assert updates(2.4)[-1] == 4  # 8 would be within the budget, but hardly
+    assert updates(2.1)[-1] == 4  # 8 would be within the budget, but hardly
     assert updates(0.5)[-1] == 16
     assert updates(100)[-1] == 2
 
