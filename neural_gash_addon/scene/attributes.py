@@ -108,8 +108,8 @@ def write_textures(obj: bpy.types.Object, transfer: TextureTransfer, *, own_uv: 
 
 
 def _check_mode(obj: bpy.types.Object) -> None:
-    """UserError in Edit Mode."""
-    if obj.mode == "EDIT":
+    """UserError in Edit Mode, also that of another object with the same mesh."""
+    if obj.data.is_editmode:
         raise UserError(f"'{obj.name}' is in Edit Mode, which would discard the bake; "
                         "leave Edit Mode and bake again.")
 
