@@ -43,7 +43,7 @@ class Steps(Worker):
                 self.progress = next(self._baking)
         except StopIteration as end:
             self.results, self._alive = end.value, False
-        except UserError as error:
+        except Exception as error:  # noqa: BLE001  as in `Worker`: the operator reports it, and gives all back
             self.error, self._alive = error, False
 
     def cancel(self) -> None:

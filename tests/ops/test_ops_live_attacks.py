@@ -8,6 +8,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from neural_gash_addon.backend import methods  # noqa: E402
+from neural_gash_addon.ops.sequence import Steps, bake_sequence  # noqa: E402
 from neural_gash_addon.scene import attributes, live, read, staleness  # noqa: E402
 
 LINE = np.linspace(-1, 1, 9)
@@ -220,3 +221,44 @@ def test_cut_while_it_plays(sheet, settings, tmp_path, capfd):
     scene.frame_set(1)
     assert not live.problem(obj)
     quiet(capfd)
+
+
+def test_a_problem_stays_said_while_others_change(sheet, make, settings):
+    obj = sheet()
+    bake(obj)
+    other = make(name="Other")
+    settings.live = True
+    obj.modifiers.new("More", "SUBSURF").levels = 1
+    bpy.context.view_layer.update()
+    assert live.problem(obj)
+    other.location.x = 5
+    bpy.context.view_layer.update()
+    assert "change its vertices" in live.problem(obj)
+
+
+def test_live_switched_on_during_a_sequence(sheet, settings, tmp_path):
+    obj = sheet()
+    bake(obj)
+    settings.sequence_folder = str(tmp_path)
+    baking = bake_sequence(bpy.context, [obj])
+    while next(baking) < 0.5:
+        pass
+    before = stored(obj)
+    settings.live = True
+    np.testing.assert_array_equal(stored(obj), before)
+    methods.run(baking)
+
+
+@pytest.mark.parametrize("error", [MemoryError("no"), RuntimeError("no")])
+def test_an_error_in_a_frame_ends_the_bake(sheet, settings, tmp_path, monkeypatch, error):
+    obj = sheet()
+    settings.sequence_folder = str(tmp_path)
+
+    def broken(*_, **__):
+        raise error
+        yield
+    monkeypatch.setattr(methods, "bake", broken)
+    steps = Steps(bake_sequence(bpy.context, [obj]))
+    steps.start()
+    steps.step()
+    assert not steps.is_alive() and steps.error is error and not live._suspended
