@@ -2,15 +2,15 @@
 """The transfer of every frame of an animation in one file, which is mapped and not read.
 
 A safetensors file (see `weights`): `coefficients` (frames, N, K) as 16-bit floats, exact to a two-thousandth, which is
-below the error of any bake; `elements` (E,), the point of each vertex or face corner. Its metadata: the record, and of
-each frame its fingerprint and rotation.
+below the error of any bake; `elements` (E,), the point of each vertex or face corner. Its metadata: the record
+of the first frame, and of each frame what differs from it: fingerprint, rotation, error, at times the method.
 """
 from __future__ import annotations
 
 import json
 import struct
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -74,8 +74,8 @@ class Writer:
         count = len(self._records)
         size = 2 * count * int(np.prod(self._shape))
         elements = np.ascontiguousarray(self._mesh.elements, "<i4")
-        every = [{"fingerprint": r.fingerprint, "frame": r.frame, "seconds": r.seconds, "rays": r.rays,
-                  "error_estimate": r.error_estimate} for r in self._records]
+        base = asdict(self._records[0])
+        every = [{name: value for name, value in asdict(r).items() if value != base[name]} for r in self._records]
         about = {"record": self._records[0].to_json(), "first": str(self._first), "frames": json.dumps(every)}
         header = {"__metadata__": about,
                   "coefficients": {"dtype": "F16", "shape": [count, *self._shape], "data_offsets": [0, size]},
@@ -118,12 +118,13 @@ def open_sequence(path: Path) -> Sequence:
             header = json.loads(file.read(length))
         about = header["__metadata__"]
         base = BakeRecord.from_json(about["record"])
-        records = [replace(base, **{**entry, "frame": tuple(entry["frame"])}) for entry in json.loads(about["frames"])]
+        records = [replace(base, **{**entry, "frame": tuple(entry.get("frame", base.frame))})
+                   for entry in json.loads(about["frames"])]
         arrays = {name: np.memmap(path, kind, "r", 8 + length + header[name]["data_offsets"][0],
                                   tuple(header[name]["shape"]))
                   for name, kind in (("coefficients", "<f2"), ("elements", "<i4"))}
         if len(arrays["coefficients"]) != len(records):
             raise ValueError(len(records))
         return Sequence(int(about["first"]), arrays["coefficients"], np.array(arrays["elements"]), records)
-    except (OSError, ValueError, KeyError, TypeError, struct.error) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, struct.error) as error:
         raise UserError(f"'{path}' is missing or no sequence that Neural GASh baked.") from error

@@ -43,7 +43,7 @@ class Steps(Worker):
                 self.progress = next(self._baking)
         except StopIteration as end:
             self.results, self._alive = end.value, False
-        except UserError as error:
+        except Exception as error:  # noqa: BLE001  as in `Worker`: the operator reports it, and gives all back
             self.error, self._alive = error, False
 
     def cancel(self) -> None:
@@ -75,19 +75,34 @@ def bake_sequence(context: bpy.types.Context, objects: list[bpy.types.Object]
     current, first, count = scene.frame_current, scene.frame_start, scene.frame_end - scene.frame_start + 1
     folder = _folder(settings.sequence_folder)
     uids = {obj.session_uid: obj.name for obj in objects}
+    group = set(uids)  # these shadow each other, also where one cannot be baked
     outcomes: list[Outcome] = []
+    paths: dict[int, Path] = {}
+    owners: dict[int | str, str] = {}  # of each mesh and file, the object that is baked to it
+    for obj in objects:
+        path = _file(folder, obj)
+        mesh, file = obj.data.session_uid, str(path).casefold()
+        if mesh in owners or file in owners:
+            outcomes.append(Outcome(obj.name, None, (
+                f"'{obj.name}' has the same mesh as '{owners[mesh]}' and shows its bake; make the mesh single-user to "
+                "bake it by itself.") if mesh in owners else (
+                f"'{obj.name}' would have the same file as '{owners[file]}'; rename one of them.")))
+            del uids[obj.session_uid]
+            continue
+        owners[mesh] = owners[file] = obj.name
+        paths[obj.session_uid] = path  # also where the object is renamed meanwhile
     writers: dict[int, Writer] = {}
     last: dict[int, tuple[Job, Transfer]] = {}
 
     def frame(uid: int, number: int) -> Generator[float, None, None]:
         """Bake one object in one frame."""
         obj = _object(uid, uids[uid])
-        job = prepare(context, obj, settings, group=[_object(*other) for other in uids.items()])
+        job = prepare(context, obj, settings, group=[o for o in bpy.data.objects if o.session_uid in group])
         found = yield from job.bake()
         assert isinstance(found, Transfer)
         transfer = replace(found, record=recorded(context, job, obj, found))
         if uid not in writers:
-            writers[uid] = Writer(_file(folder, obj), first, count, job.read.mesh)
+            writers[uid] = Writer(paths[uid], first, count, job.read.mesh)
         writers[uid].add(job.read.mesh, transfer)
         last[uid] = job, transfer
 
@@ -105,11 +120,18 @@ def bake_sequence(context: bpy.types.Context, objects: list[bpy.types.Object]
                 if not uids:
                     raise UserError(outcomes[-1].sentence)
             for uid, name in uids.items():
-                writers[uid].end()
-                outcomes.append(Outcome(name, *finish(context, *last[uid])))
-                obj = _object(uid, name)
-                path = str(_file(folder, obj))
-                obj.data[SEQUENCE] = path if settings.sequence_folder else bpy.path.relpath(path)
+                try:
+                    record, warning = finish(context, *last[uid])
+                    writers[uid].end()
+                except UserError as error:
+                    if len(uids) == 1:
+                        raise
+                    outcomes.append(Outcome(name, None, f"'{name}': {error}"))
+                    continue
+                outcomes.append(Outcome(name, record, warning))
+                written, beside = str(paths[uid]), settings.sequence_folder.startswith("//")
+                _object(uid, name).data[SEQUENCE] = (
+                    written if settings.sequence_folder and not beside else bpy.path.relpath(written))
         return outcomes
     finally:
         for writer in writers.values():
@@ -130,6 +152,9 @@ def _folder(chosen: str) -> Path:
     if not chosen and not bpy.data.filepath:
         raise UserError("Save the .blend file first, or choose a folder: the sequence is kept in a file beside it.")
     folder = Path(bpy.path.abspath(chosen or "//"))
+    if not folder.is_absolute():
+        raise UserError(f"'{chosen}' is no whole path of a folder for the sequence; begin it with // to have it beside "
+                        "the .blend file, and save that first.")
     check_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     return folder

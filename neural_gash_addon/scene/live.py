@@ -90,6 +90,8 @@ def suspended() -> Iterator[None]:
 def start(scene: bpy.types.Scene) -> None:
     """Choose how to follow each baked object of a scene that is shown, and follow it from now on."""
     forget()
+    if _suspended:
+        return  # the frame that is set after it has all followed
     depsgraph = bpy.context.evaluated_depsgraph_get()
     for obj in _followed(scene, rendered=False):
         try:
@@ -123,8 +125,9 @@ def follow(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, rendered: boo
         return written
     for obj in _followed(scene, rendered):
         try:
-            heeded = changed is None or obj.session_uid in changed or read_record(obj).occluders != SELF
-            if heeded and _update(scene, obj, depsgraph, rendered):
+            if changed is not None and obj.session_uid not in changed and read_record(obj).occluders == SELF:
+                continue
+            if _update(scene, obj, depsgraph, rendered):
                 written.append(obj)
             _problems.pop(obj.session_uid, None)
         except UserError as error:
