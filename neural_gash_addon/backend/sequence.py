@@ -123,8 +123,10 @@ def open_sequence(path: Path) -> Sequence:
         arrays = {name: np.memmap(path, kind, "r", 8 + length + header[name]["data_offsets"][0],
                                   tuple(header[name]["shape"]))
                   for name, kind in (("coefficients", "<f2"), ("elements", "<i4"))}
-        if len(arrays["coefficients"]) != len(records):
-            raise ValueError(len(records))
+        shape, elements = arrays["coefficients"].shape, arrays["elements"]
+        held = (len(records), base.points, base.order ** 2, 3)[:3 if base.colours == 1 else 4]
+        if shape != held or not len(elements) or elements.min() < 0 or elements.max() >= base.points:
+            raise ValueError(shape)
         return Sequence(int(about["first"]), arrays["coefficients"], np.array(arrays["elements"]), records)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, struct.error) as error:
         raise UserError(f"'{path}' is missing or no sequence that Neural GASh baked.") from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Generator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -71,9 +72,10 @@ def bake_sequence(context: bpy.types.Context, objects: list[bpy.types.Object]
     Raises:
         UserError: none could be baked.
     """
-    scene, settings = context.scene, context.scene.neural_gash
+    scene, settings, its = context.scene, context.scene.neural_gash, context.scene.session_uid
     current, first, count = scene.frame_current, scene.frame_start, scene.frame_end - scene.frame_start + 1
-    folder = _folder(settings.sequence_folder)
+    chosen = settings.sequence_folder
+    folder = _folder(chosen)
     uids = {obj.session_uid: obj.name for obj in objects}
     group = set(uids)  # these shadow each other, also where one cannot be baked
     outcomes: list[Outcome] = []
@@ -97,7 +99,8 @@ def bake_sequence(context: bpy.types.Context, objects: list[bpy.types.Object]
     def frame(uid: int, number: int) -> Generator[float, None, None]:
         """Bake one object in one frame."""
         obj = _object(uid, uids[uid])
-        job = prepare(context, obj, settings, group=[o for o in bpy.data.objects if o.session_uid in group])
+        together = [o for o in bpy.data.objects if o.session_uid in group]
+        job = prepare(context, obj, _scene(its).neural_gash, group=together)
         found = yield from job.bake()
         assert isinstance(found, Transfer)
         transfer = replace(found, record=recorded(context, job, obj, found))
@@ -109,7 +112,7 @@ def bake_sequence(context: bpy.types.Context, objects: list[bpy.types.Object]
     try:
         with suspended():
             for number in range(count):
-                scene.frame_set(first + number)
+                _scene(its).frame_set(first + number)  # looked up each time: undo replaces it
                 for place, uid in enumerate(list(uids)):
                     try:
                         share = 1 / (count * len(objects))
@@ -129,14 +132,23 @@ def bake_sequence(context: bpy.types.Context, objects: list[bpy.types.Object]
                     outcomes.append(Outcome(name, None, f"'{name}': {error}"))
                     continue
                 outcomes.append(Outcome(name, record, warning))
-                written, beside = str(paths[uid]), settings.sequence_folder.startswith("//")
+                written, beside = str(paths[uid]), chosen.startswith("//")
                 _object(uid, name).data[SEQUENCE] = (
-                    written if settings.sequence_folder and not beside else bpy.path.relpath(written))
+                    written if chosen and not beside else bpy.path.relpath(written))
         return outcomes
     finally:
         for writer in writers.values():
             writer.discard()
-        scene.frame_set(current)  # and what is shown with it
+        with suppress(UserError):
+            _scene(its).frame_set(current)  # and what is shown with it
+
+
+def _scene(uid: int) -> bpy.types.Scene:
+    """The scene by its session uid. Raises UserError where it is gone."""
+    scene = next((s for s in bpy.data.scenes if s.session_uid == uid), None)
+    if scene is None:
+        raise UserError("The scene was removed while its frames were being baked.")
+    return scene
 
 
 def _object(uid: int, name: str) -> bpy.types.Object:

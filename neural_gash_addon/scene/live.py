@@ -24,9 +24,10 @@ from ..backend.sequence import Sequence, open_sequence
 from ..backend.transfer import Transfer
 from .attributes import SEQUENCE, has_bake, read_record, write_transfer
 from .deforming import Deforming
+from .evaluation import shown_objects
 from .frames import rotation_part
 from .lighting import light_object
-from .read import SELF, fingerprint, read_occluders, refusal, same_fingerprint
+from .read import SELF, fingerprint, read_object, read_occluders, refusal, same_fingerprint
 
 _BESIDES = 0.15  # of the budget, for reading and writing, before any update has been timed
 _NEWEST = 0.2    # weight of the newest update in how slow updates are
@@ -51,6 +52,7 @@ class _Follower:
 _followers: dict[int, _Follower] = {}        # by session uid of the object
 _problems: dict[int, str] = {}               # why an object is not followed
 _sequences: dict[str, tuple[float, Sequence]] = {}  # path -> when the file was written, and the file
+_shown: dict[int, frozenset[int]] = {}       # session uid of a scene -> its objects that are shown, when last looked at
 _suspended = False                           # something else bakes frame by frame
 _rendering = False
 
@@ -107,6 +109,7 @@ def start(scene: bpy.types.Scene) -> None:
 def forget() -> None:
     """Follow nothing any more."""
     _followers.clear()
+    _shown.clear()
     _problems.clear()
 
 
@@ -166,7 +169,11 @@ def _update(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types.
     if same_fingerprint(now, before.fingerprint):
         return False
     follower = _followers.setdefault(obj.session_uid, _Follower())
-    mesh, matrix = follower.reader.read(obj, depsgraph)
+    if rendered:
+        read = read_object(obj, depsgraph)
+        mesh, matrix = read.mesh, read.matrix
+    else:
+        mesh, matrix = follower.reader.read(obj, depsgraph)
     occluders = read_occluders(obj, before.occluders, depsgraph)
     if rendered:
         settings = scene.neural_gash
@@ -290,6 +297,10 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     changed = {update.id.original.session_uid for update in depsgraph.updates
                if isinstance(update.id, bpy.types.Object)
                and (update.is_updated_geometry or update.is_updated_transform)}
+    if any(isinstance(update.id, (bpy.types.Scene, bpy.types.Collection)) for update in depsgraph.updates):
+        shown = frozenset(shown_objects(depsgraph.view_layer))  # what is hidden or removed is itself no update
+        changed |= _shown.get(scene.session_uid, frozenset()) ^ shown
+        _shown[scene.session_uid] = shown
     if changed:
         follow(scene, depsgraph, bpy.app.background or _rendering, changed)
 

@@ -40,6 +40,10 @@ def _on_turned() -> None:
 def _on_load(*_: object) -> None:
     """Another file, with viewports of its own; Blender has forgotten who listens."""
     _known.clear()
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                _known[area.spaces.active.as_pointer()] = area.spaces.active.shading.studiolight_rotate_z
     _listen()
 
 

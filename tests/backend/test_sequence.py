@@ -81,7 +81,8 @@ def test_a_file_that_cannot_be_made(tmp_path):
         Writer(tmp_path / "no" / "a.prtseq", 1, 1, MESH)
 
 
-@pytest.mark.parametrize("damage", ["missing", "empty", "cut", "text", "length", "record", "count"])
+@pytest.mark.parametrize("damage", ["missing", "empty", "cut", "text", "length", "record", "count", "shape",
+                                    "elements"])
 def test_damaged_files_are_refused(tmp_path, damage):
     path = tmp_path / "a.prtseq"
     if damage != "missing":
@@ -93,7 +94,11 @@ def test_damaged_files_are_refused(tmp_path, damage):
             header["__metadata__"]["record"] = "{}"
         if damage == "count":
             header["__metadata__"]["frames"] = "[]"
+        if damage == "shape":
+            header["coefficients"]["shape"][1] -= 1
         changed = data[:8] + json.dumps(header).encode().ljust(len(text)) + data[8 + len(text):]
+        if damage == "elements":
+            changed = data[:-4] + b"\xff\xff\xff\x7f"
         path.write_bytes({"empty": b"", "cut": data[:-200], "text": b"hello, this is no sequence at all",
                           "length": b"\xff" * 8 + data[8:]}.get(damage, changed))
     with pytest.raises(UserError, match="missing or no sequence"):

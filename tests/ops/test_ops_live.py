@@ -197,6 +197,31 @@ def test_other_objects_are_followed_where_they_cast_shadows(make, settings):
     assert not attributes.has_bake(lid)
 
 
+@pytest.mark.parametrize("how", ["hidden", "removed", "collection"])
+def test_others_that_go_take_their_shadow_with_them(make, settings, how):
+    ground = make([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], [(0, 1, 2, 3)], "Ground")
+    settings.occluders = "VISIBLE"
+    lid = make([(-1, -1, 1), (1, -1, 1), (1, 1, 1), (-1, 1, 1)], [(3, 2, 1, 0)], "Lid")
+    there = bpy.data.collections.new("There")
+    bpy.context.scene.collection.children.link(there)
+    there.objects.link(lid)
+    bpy.context.scene.collection.objects.unlink(lid)
+    bpy.context.view_layer.objects.active = ground
+    ground.select_set(True)
+    lid.select_set(False)
+    bpy.ops.neural_gash.bake()
+    settings.live = True
+    assert stored(ground)[:, 0].mean() < 0.9 * FULL
+    if how == "hidden":
+        lid.hide_set(True)
+    elif how == "removed":
+        bpy.data.objects.remove(lid)
+    else:
+        bpy.context.view_layer.layer_collection.children["There"].exclude = True
+    bpy.context.view_layer.update()
+    np.testing.assert_allclose(stored(ground)[:, 0], FULL, rtol=1e-3)
+
+
 def test_turned_and_deformed_it_stays_lit_from_the_same_side(wing, settings):
     """Turning alone turns the light; the next deformation is baked in another frame, and lit in that."""
     settings.live = True
@@ -376,6 +401,18 @@ def test_a_cancelled_sequence_leaves_nothing(wing, settings, tmp_path):
     assert bpy.context.scene.frame_current == 2 and not list(tmp_path.iterdir())
     np.testing.assert_array_equal(stored(wing), before)
     assert attributes.SEQUENCE not in wing.data and not live._suspended
+
+
+def test_a_scene_that_is_removed_meanwhile(wing, settings, tmp_path):
+    settings.sequence_folder = str(tmp_path)
+    baking = bake_sequence(bpy.context, [wing])
+    next(baking)
+    other = bpy.data.scenes.new("Other")
+    bpy.data.scenes.remove(bpy.context.scene)
+    with pytest.raises(Exception, match="removed|deleted|No object"):
+        for _ in baking:
+            pass
+    assert not list(tmp_path.iterdir()) and not live._suspended and other.name == "Other"
 
 
 def test_one_that_fails_spares_the_other(wing, make, settings, tmp_path):
