@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Irradiance in a room by the light-transport embedding: encode the room once, then ask for any points. Needs torch."""
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import embedding
+from .errors import UserError
+from .nearest import nearest_to
+
+QUERIES_AT_ONCE = 4096  # decoded together, so that memory does not grow with their number
+
+
+class Room:
+    """A room's codes, which answer for any point."""
+
+    def __init__(self, model: Any, points: NDArray) -> None:
+        """Encode scene points.
+
+        Args:
+            model: networks.embedding.Embedding, on its device, in `eval` mode.
+            points: (M, 12) position (metres), unit normal, albedo, emitted radiance (linear RGB), in farthest-point
+                order, M >= 1.
+        Raises:
+            UserError: the room is larger than any that the network knows.
+        """
+        import torch
+
+        from .networks.embedding import Layout, level
+
+        size = float(np.ptp(points[:, :3], axis=0).max())
+        if size > embedding.EXTENT:
+            raise UserError(f"The room is {size:.1f} m long, and the network knows rooms of up to "
+                            f"{embedding.EXTENT:.0f} m; bake it in parts, or choose another method.")
+        self.model, self.positions = model, np.asarray(points[:, :3], np.float64)
+        sizes, self._where = model.settings, next(model.parameters()).device
+        stages = len(sizes.depths)
+        albedo, emission = self._tensor(points[:, 6:9].T), self._tensor(points[:, 9:12].T)
+        self.level = level(albedo, emission)  # (3,); zero where nothing shines, and all is dark
+        places = embedding.normalised(self.positions, self.positions)
+        known = Layout.of(embedding.layout(self.positions, stages, sizes.gathered, sizes.around), self._where)
+        orders = [torch.from_numpy(order).to(self._where) for order in embedding.orders(places, stages)]
+        with torch.no_grad():
+            self.codes = model.encoder(self._tensor(places), self._tensor(points[:, 3:6]), albedo,
+                                       emission / self.level.clamp_min(1e-30)[:, None], known, orders)
+        self.places = self._tensor(places[:self.codes.shape[1]])
+
+    def irradiance(self, queries: NDArray) -> Generator[float, None, NDArray[np.float32]]:
+        """(N, 3) irradiance, linear RGB, of queries (N, 9): position, unit normal, albedo. Yields progress."""
+        import torch
+
+        out = np.empty((len(queries), 3), np.float32)
+        count = self.codes.shape[1]
+        for start in range(0, len(queries), QUERIES_AT_ONCE):
+            part = queries[start:start + QUERIES_AT_ONCE]
+            near = nearest_to(part[:, :3], self.positions[:count], self.model.settings.neighbours)
+            places = embedding.normalised(part[:, :3], self.positions)
+            with torch.no_grad():
+                found = self.model.decoder(self.codes, self.places, self._tensor(places), self._tensor(part[:, 3:6]),
+                                           self._tensor(part[:, 6:9].T), torch.from_numpy(near).to(self._where))
+                out[start:start + len(part)] = (found.expm1() * self.level[:, None]).T.cpu().numpy()
+            yield min((start + len(part)) / len(queries), 1.0)
+        return out
+
+    def _tensor(self, array: NDArray) -> Any:
+        import torch
+
+        return torch.from_numpy(np.ascontiguousarray(array, np.float32)).to(self._where)
