@@ -17,6 +17,7 @@ from . import serialise
 from .nearest import nearest_to
 
 EXTENT = 20.0   # metres: the largest side of a room; one for all, as light falls off with true distances (A.3)
+_BESIDE = 3     # neighbours whose distance tells a point's area: few, as a small lamp has few
 HALVINGS = 2    # of the nearest-neighbour embedding: a quarter of the scene points are codes (section 3.3)
 
 Indices = NDArray[np.int64]
@@ -63,6 +64,16 @@ def orders(places: NDArray, stages: int) -> list[Indices]:
         out.append(serialise.orders(places[:count]))
         count = -(-count // 2)
     return out
+
+
+def areas(positions: NDArray) -> NDArray[np.float32]:
+    """(M,) square metres that each scene point (M, 3) stands for, about: as on a plane of equilateral triangles.
+
+    Samples are denser on emitters, so counting points would not tell how much of a room shines.
+    """
+    near = nearest_to(positions, positions, 1 + _BESIDE)[:, 1:]
+    square = np.square(positions[near] - positions[:, None]).sum(2).sum(1) / max(near.shape[1], 1)
+    return (np.sqrt(0.75) * square).astype(np.float32)
 
 
 def normalised(positions: NDArray, scene: NDArray) -> NDArray[np.float32]:

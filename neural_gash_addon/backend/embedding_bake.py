@@ -40,12 +40,13 @@ class Room:
         sizes, self._where = model.settings, next(model.parameters()).device
         stages = len(sizes.depths)
         albedo, emission = self._tensor(points[:, 6:9].T), self._tensor(points[:, 9:12].T)
-        self.level = level(albedo, emission)  # (3,); zero where nothing shines, and all is dark
+        areas = self._tensor(embedding.areas(self.positions))
+        self.level = level(albedo, emission, areas)  # (3,); zero where nothing shines, and all is dark
         places = embedding.normalised(self.positions, self.positions)
         known = Layout.of(embedding.layout(self.positions, stages, sizes.gathered, sizes.around), self._where)
         orders = [torch.from_numpy(order).to(self._where) for order in embedding.orders(places, stages)]
         with torch.no_grad():
-            self.codes = model.encoder(self._tensor(places), self._tensor(points[:, 3:6]), albedo,
+            self.codes = model.encoder(self._tensor(places), self._tensor(points[:, 3:6]), areas, albedo,
                                        emission / self.level.clamp_min(1e-30)[:, None], known, orders)
         self.places = self._tensor(places[:self.codes.shape[1]])
 

@@ -226,13 +226,26 @@ def test_too_large_a_room_is_refused_with_its_size(room, model):
         embedding_bake.Room(model, points)
 
 
-def test_an_untrained_network_gives_the_level_of_an_integrating_sphere(room):
+def test_an_untrained_network_gives_the_level_of_an_integrating_sphere():
+    """Of which all is half white, and a fifth of the surface emits: pi e / 5 / (1 - 1 / 2)."""
     torch.manual_seed(0)
-    points, queries = room
-    points = points.copy()
-    points[:, 6:9] = 0.5
+    turns, rise = np.arange(1000) * np.pi * (3 - 5 ** 0.5), 1 - (2 * np.arange(1000) + 1) / 1000
+    round_ = np.sqrt(1 - rise ** 2)
+    positions = np.stack([round_ * np.cos(turns), round_ * np.sin(turns), rise], 1)
+    emission = (rise > 0.6)[:, None] * np.array([1, 2, 3])
+    points = np.concatenate([positions, -positions, np.full((1000, 3), 0.5), emission], 1)
+    queries = points[::50, :9]
     found = irradiance(networks.Embedding(TINY).eval(), points, queries)
-    np.testing.assert_allclose(found, [np.pi * points[:, 9:].mean(0) / 0.5] * len(queries), rtol=1e-4)
+    np.testing.assert_allclose(found, [np.pi * np.array([1, 2, 3]) / 5 / 0.5] * len(queries), rtol=0.02)
+
+
+def test_areas_are_of_what_points_stand_for_whatever_their_density():
+    rng = np.random.default_rng(0)
+    square = rng.random((1200, 3)) * [1, 1, 0]
+    square = square[farthest(square, 150)]
+    found = embedding.areas(np.concatenate([square * 5, square + [9, 9, 3]]))
+    assert 0.75 * 25 < found[:150].sum() < 1.25 * 25 and 0.75 < found[150:].sum() < 1.25
+    assert (embedding.areas(np.ones((7, 3))) == 0).all() and embedding.areas(np.ones((1, 3))).tolist() == [0]
 
 
 def asked(model, room):
@@ -243,7 +256,8 @@ def asked(model, room):
     layout = networks.Layout.of(embedding.layout(points[:, :3].numpy(), len(settings.depths), settings.gathered,
                                                  settings.around), torch.device("cpu"))
     orders = [torch.from_numpy(each) for each in embedding.orders(places.numpy(), len(settings.depths))]
-    codes = model.encoder(places, points[:, 3:6], points[:, 6:9].T, points[:, 9:].T, layout, orders)
+    areas = torch.from_numpy(embedding.areas(points[:, :3].numpy()))
+    codes = model.encoder(places, points[:, 3:6], areas, points[:, 6:9].T, points[:, 9:].T, layout, orders)
     near = embedding.nearest_to(queries[:, :3].numpy(), points[:codes.shape[1], :3].numpy(), settings.neighbours)
     return model.decoder(codes, places[:codes.shape[1]],
                          torch.from_numpy(embedding.normalised(queries[:, :3].numpy(), points[:, :3].numpy())),

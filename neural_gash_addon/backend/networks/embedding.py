@@ -52,12 +52,16 @@ SMALL = Settings(width=64, depths=(2, 2, 2), channels=(64, 96, 128), layers=2, d
 FULL = Settings(width=128, depths=(2, 2, 2, 6, 2), channels=(128, 128, 128, 256, 256), layers=6, dropout=0.1)
 
 
-def level(albedo: Tensor, emission: Tensor) -> Tensor:
+def level(albedo: Tensor, emission: Tensor, areas: Tensor) -> Tensor:
     """(B,) the irradiance in an integrating sphere with a room's mean albedo and emission: pi e / (1 - a).
 
-    A unit for emission and irradiance, not an estimate to be relied on. albedo, emission: (B, M) of scene points.
+    A unit for emission and irradiance, not an estimate to be relied on.
+
+    Args:
+        albedo, emission: (B, M) of scene points. areas: (M,) that they stand for.
     """
-    return math.pi * emission.mean(1) / (1 - albedo.mean(1).clamp(max=BRIGHTEST))
+    share = areas / areas.sum().clamp_min(1e-30)
+    return math.pi * (emission @ share) / (1 - (albedo @ share).clamp(max=BRIGHTEST))
 
 
 def _waves(places: Tensor) -> Tensor:
@@ -169,7 +173,7 @@ class Encoder(nn.Module):
     def __init__(self, settings: Settings) -> None:
         super().__init__()
         width, channels = settings.width, settings.channels
-        self.enter = _perceptron(3 + 6 * OCTAVES + 5, width, width)
+        self.enter = _perceptron(3 + 6 * OCTAVES + 6, width, width)
         sizes = (*[width] * HALVINGS, *channels)
         self.halvings = nn.ModuleList(Halving(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True))
         self.depths = settings.depths
@@ -179,16 +183,16 @@ class Encoder(nn.Module):
         self.down = nn.ModuleList(nn.Linear(b, a) for a, b in zip(channels[:-1], channels[1:], strict=True))
         self.leave = nn.Sequential(nn.LayerNorm(channels[0]), nn.Linear(channels[0], width))
 
-    def forward(self, places: Tensor, normals: Tensor, albedo: Tensor, emission: Tensor, layout: Layout,
-                orders: list[Tensor]) -> Tensor:
+    def forward(self, places: Tensor, normals: Tensor, areas: Tensor, albedo: Tensor, emission: Tensor,
+                layout: Layout, orders: list[Tensor]) -> Tensor:
         """To the codes (B, m, D) of B channels of a room.
 
         Args:
-            places: (M, 3) of scene points in farthest-point order, normalised. normals: (M, 3).
+            places: (M, 3) of scene points in farthest-point order, normalised. normals: (M, 3). areas: (M,).
             albedo, emission: (B, M), emission in units of the level.
             layout: of the scene points. orders: (CURVES, m) of each stage.
         """
-        shared = torch.cat([_waves(places), normals], 1)
+        shared = torch.cat([_waves(places), normals, areas[:, None].clamp_min(1e-6).log()], 1)
         own = torch.stack([albedo, emission.log1p()], 2)
         x = self.enter(torch.cat([shared.expand(len(albedo), -1, -1), own], 2))
         # each block takes the next curve; in training, in an order drawn anew (Wu et al. 2024, "shuffle order")
