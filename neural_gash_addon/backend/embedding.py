@@ -17,7 +17,8 @@ from . import serialise
 from .nearest import nearest_to
 
 EXTENT = 20.0   # metres: the largest side of a room; one for all, as light falls off with true distances (A.3)
-_BESIDE = 3     # neighbours whose distance tells a point's area: few, as a small lamp has few
+_BESIDE = 6     # neighbours whose distance tells a point's area
+_AREA = 0.95    # of their mean squared distance; measured on 16 rooms of training.rooms: 0.93 of all, 1.0 of lamps
 HALVINGS = 2    # of the nearest-neighbour embedding: a quarter of the scene points are codes (section 3.3)
 
 Indices = NDArray[np.int64]
@@ -67,13 +68,13 @@ def orders(places: NDArray, stages: int) -> list[Indices]:
 
 
 def areas(positions: NDArray) -> NDArray[np.float32]:
-    """(M,) square metres that each scene point (M, 3) stands for, about: as on a plane of equilateral triangles.
+    """(M,) square metres that each scene point (M, 3) stands for, about, by how far the points beside it are.
 
     Samples are denser on emitters, so counting points would not tell how much of a room shines.
     """
     near = nearest_to(positions, positions, 1 + _BESIDE)[:, 1:]
     square = np.square(positions[near] - positions[:, None]).sum(2).sum(1) / max(near.shape[1], 1)
-    return (np.sqrt(0.75) * square).astype(np.float32)
+    return (_AREA * square).astype(np.float32)
 
 
 def normalised(positions: NDArray, scene: NDArray) -> NDArray[np.float32]:

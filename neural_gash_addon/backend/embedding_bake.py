@@ -30,7 +30,7 @@ class Room:
         """
         import torch
 
-        from .networks.embedding import Layout, level
+        from .networks.embedding import Layout, level, shining
 
         size = float(np.ptp(points[:, :3], axis=0).max())
         if size > embedding.EXTENT:
@@ -45,9 +45,13 @@ class Room:
         places = embedding.normalised(self.positions, self.positions)
         known = Layout.of(embedding.layout(self.positions, stages, sizes.gathered, sizes.around), self._where)
         orders = [torch.from_numpy(order).to(self._where) for order in embedding.orders(places, stages)]
+        emission = emission / self.level.clamp_min(1e-30)[:, None]
+        normals = self._tensor(points[:, 3:6])
+        rows, lamp_areas = shining(emission, areas)
+        self.lamps = (self._tensor(places)[rows] * embedding.EXTENT, normals[rows], lamp_areas, emission[:, rows])
         with torch.no_grad():
-            self.codes = model.encoder(self._tensor(places), self._tensor(points[:, 3:6]), areas, albedo,
-                                       emission / self.level.clamp_min(1e-30)[:, None], known, orders)
+            self.codes = model.encoder(self._tensor(places), normals, areas, albedo, emission,
+                                       self._direct(places, points[:, 3:6]), known, orders)
         self.places = self._tensor(places[:self.codes.shape[1]])
 
     def irradiance(self, queries: NDArray) -> Generator[float, None, NDArray[np.float32]]:
@@ -62,10 +66,21 @@ class Room:
             places = embedding.normalised(part[:, :3], self.positions)
             with torch.no_grad():
                 found = self.model.decoder(self.codes, self.places, self._tensor(places), self._tensor(part[:, 3:6]),
-                                           self._tensor(part[:, 6:9].T), torch.from_numpy(near).to(self._where))
+                                           self._tensor(part[:, 6:9].T), self._direct(places, part[:, 3:6]),
+                                           torch.from_numpy(near).to(self._where))
                 out[start:start + len(part)] = (found.expm1() * self.level[:, None]).T.cpu().numpy()
             yield min((start + len(part)) / len(queries), 1.0)
         return out
+
+    def _direct(self, places: NDArray, normals: NDArray) -> Any:
+        """(3, n) unshadowed light of the lamps at normalised places, in units of the level."""
+        import torch
+
+        from .networks.embedding import direct
+
+        return torch.cat([direct(self._tensor(places[at:at + QUERIES_AT_ONCE]) * embedding.EXTENT,
+                                 self._tensor(normals[at:at + QUERIES_AT_ONCE]), *self.lamps)
+                          for at in range(0, len(places), QUERIES_AT_ONCE)], 1)
 
     def _tensor(self, array: NDArray) -> Any:
         import torch

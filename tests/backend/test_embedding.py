@@ -227,7 +227,7 @@ def test_too_large_a_room_is_refused_with_its_size(room, model):
 
 
 def test_an_untrained_network_gives_the_level_of_an_integrating_sphere():
-    """Of which all is half white, and a fifth of the surface emits: pi e / 5 / (1 - 1 / 2)."""
+    """Of which all is half white, and a fifth of the surface emits: pi e / 5 / (1 - 1 / 2); and half of the direct."""
     torch.manual_seed(0)
     turns, rise = np.arange(1000) * np.pi * (3 - 5 ** 0.5), 1 - (2 * np.arange(1000) + 1) / 1000
     round_ = np.sqrt(1 - rise ** 2)
@@ -236,14 +236,45 @@ def test_an_untrained_network_gives_the_level_of_an_integrating_sphere():
     points = np.concatenate([positions, -positions, np.full((1000, 3), 0.5), emission], 1)
     queries = points[::50, :9]
     found = irradiance(networks.Embedding(TINY).eval(), points, queries)
-    np.testing.assert_allclose(found, [np.pi * np.array([1, 2, 3]) / 5 / 0.5] * len(queries), rtol=0.02)
+    np.testing.assert_allclose(found, [np.pi * np.array([1, 2, 3]) / 5 * (2 + 0.5)] * len(queries), rtol=0.08)
+
+
+def test_direct_light_is_that_of_a_disc():
+    """On a disc's axis pi R^2 / (R^2 + d^2), by Lambert; from far off, of any lamps, a sum over cosines."""
+    up, down = torch.tensor([[0, 0, 1.0]]), torch.tensor([[0, 0, -1.0]])
+    for distance in (0.0, 1e-3, 0.1, 1.0, 7.0):
+        found = networks.direct(torch.zeros(1, 3), up, up * distance, down, torch.tensor([2.0]), torch.tensor([[3.0]]))
+        expected = 3 * 2 / (2 / np.pi + distance ** 2) if distance else 0
+        np.testing.assert_allclose(found, [[expected]], rtol=1e-5)
+    rng = np.random.default_rng(0)
+    places, lamps = rng.random((9, 3)) * 4, rng.random((7, 3)) * 4 + [0, 0, 40]
+    normals, turned = (v / np.linalg.norm(v, axis=1)[:, None] for v in (rng.normal(size=(n, 3)) for n in (9, 7)))
+    areas, emission = rng.random(7) * 0.1, rng.random((2, 7))
+    found = networks.direct(*(torch.from_numpy(each) for each in (places, normals, lamps, turned, areas, emission)))
+    for j in range(9):
+        total = np.zeros(2)
+        for lamp in range(7):
+            way = lamps[lamp] - places[j]
+            length = np.linalg.norm(way)
+            cosines = max(way @ normals[j], 0) * max(-way @ turned[lamp], 0) / length ** 2
+            total += emission[:, lamp] * areas[lamp] * cosines / length ** 2
+        np.testing.assert_allclose(found[:, j], total, rtol=1e-4)
+
+
+def test_many_lamps_are_stood_for_by_the_first(monkeypatch):
+    monkeypatch.setattr(networks, "LAMPS", 3)
+    emission = torch.tensor([[0, 1, 0, 2, 0, 0, 0], [0, 0, 0, 0, 3, 4, 0.0]])
+    rows, areas = networks.shining(emission, torch.tensor([9, 1, 9, 1, 1, 3, 9.0]))
+    assert rows.tolist() == [1, 3, 4] and areas.tolist() == [2, 2, 2]
+    assert networks.shining(emission * 0, torch.ones(7))[0].tolist() == []
 
 
 def test_areas_are_of_what_points_stand_for_whatever_their_density():
     rng = np.random.default_rng(0)
-    square = rng.random((1200, 3)) * [1, 1, 0]
-    square = square[farthest(square, 150)]
-    found = embedding.areas(np.concatenate([square * 5, square + [9, 9, 3]]))
+    sphere = rng.normal(size=(1200, 3))
+    sphere /= np.linalg.norm(sphere, axis=1)[:, None]
+    sphere = sphere[farthest(sphere, 150)]
+    found = embedding.areas(np.concatenate([sphere * 5, sphere + [9, 9, 9]])) / (4 * np.pi)
     assert 0.75 * 25 < found[:150].sum() < 1.25 * 25 and 0.75 < found[150:].sum() < 1.25
     assert (embedding.areas(np.ones((7, 3))) == 0).all() and embedding.areas(np.ones((1, 3))).tolist() == [0]
 
@@ -257,15 +288,17 @@ def asked(model, room):
                                                  settings.around), torch.device("cpu"))
     orders = [torch.from_numpy(each) for each in embedding.orders(places.numpy(), len(settings.depths))]
     areas = torch.from_numpy(embedding.areas(points[:, :3].numpy()))
-    codes = model.encoder(places, points[:, 3:6], areas, points[:, 6:9].T, points[:, 9:].T, layout, orders)
+    codes = model.encoder(places, points[:, 3:6], areas, points[:, 6:9].T, points[:, 9:].T, torch.ones(3, 150), layout,
+                          orders)
     near = embedding.nearest_to(queries[:, :3].numpy(), points[:codes.shape[1], :3].numpy(), settings.neighbours)
     return model.decoder(codes, places[:codes.shape[1]],
                          torch.from_numpy(embedding.normalised(queries[:, :3].numpy(), points[:, :3].numpy())),
-                         queries[:, 3:6], queries[:, 6:].T, torch.from_numpy(near))
+                         queries[:, 3:6], queries[:, 6:].T, torch.ones(3, 60), torch.from_numpy(near))
 
 
 def test_every_weight_is_learned_from(room):
     model = network().train()
+    torch.manual_seed(0)
     asked(model, room).square().mean().backward()
     for name, parameter in model.named_parameters():
         assert parameter.grad is not None and parameter.grad.abs().max() > 1e-7, name

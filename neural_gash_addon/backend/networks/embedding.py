@@ -6,6 +6,8 @@ differs from the paper:
 - Colour channels are separate problems, as light keeps its colour where it bounces: the irradiance of a channel depends
   on that channel's albedo and emission alone. Each is asked by itself, as an item of a batch.
 - Light is linear in emission, so emission is read, and irradiance given, in units of `level`.
+- What lamps would give if nothing stood between is a plain sum (`direct`), so it is not learned but read, by scene
+  points and queries; the network gives the share of it that arrives, and the light that has bounced.
 - Its Point Transformer V3 finds a code's surroundings by sparse convolution; here a depthwise one over the nearest
   codes, its kernel a perceptron of their offsets. Stages are halved as in the nearest-neighbour embedding, by the
   farthest-point order, and not by a grid; the way back up has no blocks of its own, as the paper names none.
@@ -29,6 +31,7 @@ from ..serialise import CURVES
 
 HEAD = 32             # numbers of an attention head (Table 3: D / 32 heads)
 OCTAVES = 6           # of sines and cosines: wavelengths of 20 m to 0.6 m, a few codes' spacings
+LAMPS = 1024          # scene points that shine, at most, in `direct`: what a query costs does not grow with the scene
 GREATEST = 20.0       # logarithm of irradiance in units of the level: above any scene's, and its exp is finite
 BRIGHTEST = 0.95      # albedo of a room, at most: `level` has a pole at 1
 
@@ -62,6 +65,32 @@ def level(albedo: Tensor, emission: Tensor, areas: Tensor) -> Tensor:
     """
     share = areas / areas.sum().clamp_min(1e-30)
     return math.pi * (emission @ share) / (1 - (albedo @ share).clamp(max=BRIGHTEST))
+
+
+def direct(places: Tensor, normals: Tensor, lamps: Tensor, lamp_normals: Tensor, areas: Tensor, emission: Tensor
+           ) -> Tensor:
+    """(B, n) irradiance from lamps, each a disc of its area, with nothing between.
+
+    Args:
+        places, normals: (n, 3). lamps, lamp_normals: (L, 3). All in metres. areas: (L,). emission: (B, L).
+    """
+    way = [lamps[:, axis] - places[:, axis, None] for axis in range(3)]
+    square = way[0] ** 2 + way[1] ** 2 + way[2] ** 2
+    here = (way[0] * normals[:, 0, None] + way[1] * normals[:, 1, None] + way[2] * normals[:, 2, None]).clamp_min(0)
+    there = -(way[0] * lamp_normals[:, 0] + way[1] * lamp_normals[:, 1] + way[2] * lamp_normals[:, 2]).clamp_max(0)
+    # on its axis, exactly a disc's; 0 / 0 where a query is on the lamp itself
+    seen = here * there * areas / (square * (square + areas / math.pi)).clamp_min(1e-20)
+    return emission @ seen.T
+
+
+def shining(emission: Tensor, areas: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows (L,) of scene points that stand for all that shine, and the areas (L,) that they stand for.
+
+    The first LAMPS: in farthest-point order they are spread over all. emission: (B, M). areas: (M,).
+    """
+    every = emission.any(0).nonzero()[:, 0]
+    rows = every[:LAMPS]
+    return rows, areas[rows] * (areas[every].sum() / areas[rows].sum().clamp_min(1e-30))
 
 
 def _waves(places: Tensor) -> Tensor:
@@ -173,7 +202,7 @@ class Encoder(nn.Module):
     def __init__(self, settings: Settings) -> None:
         super().__init__()
         width, channels = settings.width, settings.channels
-        self.enter = _perceptron(3 + 6 * OCTAVES + 6, width, width)
+        self.enter = _perceptron(3 + 6 * OCTAVES + 7, width, width)
         sizes = (*[width] * HALVINGS, *channels)
         self.halvings = nn.ModuleList(Halving(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True))
         self.depths = settings.depths
@@ -184,16 +213,16 @@ class Encoder(nn.Module):
         self.leave = nn.Sequential(nn.LayerNorm(channels[0]), nn.Linear(channels[0], width))
 
     def forward(self, places: Tensor, normals: Tensor, areas: Tensor, albedo: Tensor, emission: Tensor,
-                layout: Layout, orders: list[Tensor]) -> Tensor:
+                direct: Tensor, layout: Layout, orders: list[Tensor]) -> Tensor:
         """To the codes (B, m, D) of B channels of a room.
 
         Args:
             places: (M, 3) of scene points in farthest-point order, normalised. normals: (M, 3). areas: (M,).
-            albedo, emission: (B, M), emission in units of the level.
+            albedo, emission, direct: (B, M), the latter two in units of the level.
             layout: of the scene points. orders: (CURVES, m) of each stage.
         """
         shared = torch.cat([_waves(places), normals, areas[:, None].clamp_min(1e-6).log()], 1)
-        own = torch.stack([albedo, emission.log1p()], 2)
+        own = torch.stack([albedo, emission.log1p(), direct.log1p()], 2)
         x = self.enter(torch.cat([shared.expand(len(albedo), -1, -1), own], 2))
         # each block takes the next curve; in training, in an order drawn anew (Wu et al. 2024, "shuffle order")
         curves = torch.randperm(CURVES).tolist() if self.training else list(range(CURVES))
@@ -238,34 +267,35 @@ class Decoder(nn.Module):
     def __init__(self, settings: Settings) -> None:
         super().__init__()
         width = settings.width
-        self.enter = _perceptron(3 + 6 * OCTAVES + 4, width, width)
+        self.enter = _perceptron(3 + 6 * OCTAVES + 5, width, width)
         self.offset = _perceptron(3, width, width)
         self.attention = nn.ModuleList(VectorAttention(width) for _ in range(settings.layers))
         self.mix = nn.ModuleList(_perceptron(width, 4 * width, width) for _ in range(settings.layers))
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(2 * settings.layers))
         self.dropout = nn.Dropout(settings.dropout)
         self.finish = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width), nn.GELU())
-        self.leave = nn.Linear(width, 1)
+        self.leave = nn.Linear(width, 2)
 
     def forward(self, codes: Tensor, code_places: Tensor, places: Tensor, normals: Tensor, albedo: Tensor,
-                near: Tensor) -> Tensor:
+                direct: Tensor, near: Tensor) -> Tensor:
         """(B, n) log(1 + irradiance in units of the level).
 
         Args:
             codes: (B, m, D), at code_places (m, 3).
-            places, normals: (n, 3) of queries. albedo: (B, n). near: (n, k) the codes nearest to each.
+            places, normals: (n, 3) of queries. albedo, direct: (B, n). near: (n, k) the codes nearest to each.
         """
         shared = torch.cat([_waves(places), normals], 1)
-        x = self.enter(torch.cat([shared.expand(len(albedo), -1, -1), albedo[:, :, None]], 2))
+        x = self.enter(torch.cat([shared.expand(len(albedo), -1, -1), torch.stack([albedo, direct.log1p()], 2)], 2))
         offset = self.offset((places[:, None] - code_places[near]) * EXTENT)
         for number, (attention, mix) in enumerate(zip(self.attention, self.mix, strict=True)):
             x = x + self.dropout(attention(self.norms[2 * number](x), codes, near, offset))
             x = x + self.dropout(mix(self.norms[2 * number + 1](x)))
-        return functional.softplus(self.leave(self.finish(x))[..., 0]).clamp(max=GREATEST)
+        arrives, bounced = self.leave(self.finish(x)).unbind(2)
+        return (direct * arrives.sigmoid() + functional.softplus(bounced).clamp(max=GREATEST).expm1()).log1p()
 
 
 class Embedding(nn.Module):
-    """Both. Before training it gives each point of a room the level, as softplus(0) = log 2."""
+    """Both. Before training it gives each point half of the direct light, and the level, as softplus(0) = log 2."""
 
     def __init__(self, settings: Settings) -> None:
         super().__init__()
