@@ -50,7 +50,7 @@ class Recipe:
     every: int     # steps, the held-out rooms are looked at and all is saved
 
 
-RECIPES = {"small": Recipe(SMALL, 5_000, 1e-3, 1, 2048, 250),            # an hour of one CPU core
+RECIPES = {"small": Recipe(SMALL, 6_000, 1e-3, 1, 1024, 250),            # an hour of one CPU core
            "full": Recipe(FULL, 2_000_000, 2e-4, 3, 8192, 10_000)}       # Table 3
 
 
