@@ -232,7 +232,7 @@ def main() -> None:
     log = Path(__file__).parent / "logs" / f"{NAME}.csv"
     model = train(recipe, kept, held, arguments.seed, arguments.cache / f"{NAME}.checkpoint", log)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    weights.save(arguments.out / f"{NAME}.safetensors",
+    weights.save(arguments.out / weights.EMBEDDING,
                  {name: value.cpu().numpy() for name, value in model.state_dict().items()})
     draw(log, ["loss", "log_l2", "rel_mse_median"])
     print(f"{len(kept)} rooms, {len(held)} held out\n{table(model, held)}")

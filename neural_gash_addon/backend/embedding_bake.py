@@ -8,11 +8,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import embedding
+from . import embedding, weights
 from .errors import UserError
 from .nearest import nearest_to
+from .paper_bake import import_torch
 
 QUERIES_AT_ONCE = 4096  # decoded together, so that memory does not grow with their number
+
+
+def network() -> Any:
+    """The network that ships: networks.embedding.Embedding, on the GPU where there is one, in `eval` mode.
+
+    Raises:
+        UserError: no torch, or weights that are not those that were shipped.
+    """
+    torch = import_torch("embedding")
+    from .networks.embedding import SMALL, Embedding
+
+    model = Embedding(SMALL)
+    arrays = weights.load(weights.FOLDER / weights.EMBEDDING)
+    model.load_state_dict({key: torch.from_numpy(array.copy()) for key, array in arrays.items()})
+    return model.to("cuda" if torch.cuda.is_available() else "cpu").eval()
 
 
 class Room:
@@ -24,14 +40,16 @@ class Room:
         Args:
             model: networks.embedding.Embedding, on its device, in `eval` mode.
             points: (M, 12) position (metres), unit normal, albedo, emitted radiance (linear RGB), in farthest-point
-                order, M >= 1.
+                order.
         Raises:
-            UserError: the room is larger than any that the network knows.
+            UserError: there are no points, or the room is larger than any that the network knows.
         """
         import torch
 
         from .networks.embedding import Layout, level, shining
 
+        if not len(points):
+            raise UserError("There is no surface in the room; add one, or choose another method.")
         size = float(np.ptp(points[:, :3], axis=0).max())
         if size > embedding.EXTENT:
             raise UserError(f"The room is {size:.1f} m long, and the network knows rooms of up to "

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The light-transport embedding: layers against loops over the paper's equations, and what holds for any room."""
+import sys
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -7,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 torch = pytest.importorskip("torch")
 
-from neural_gash_addon.backend import embedding, embedding_bake, serialise  # noqa: E402
+from neural_gash_addon.backend import embedding, embedding_bake, serialise, weights  # noqa: E402
 from neural_gash_addon.backend.errors import UserError  # noqa: E402
 from neural_gash_addon.backend.methods import run  # noqa: E402
 from neural_gash_addon.backend.networks import embedding as networks  # noqa: E402
@@ -217,6 +219,26 @@ def test_degenerate_rooms_have_numbers_and_are_dark_where_nothing_shines(points,
     found = irradiance(network(settings), points.astype(np.float32), queries)
     assert np.isfinite(found).all() and (found >= 0).all()
     assert (found[:, points[:, 9:].sum(0) == 0] == 0).all()
+
+
+def test_no_surface_at_all_is_refused(model):
+    with pytest.raises(UserError, match="no surface"):
+        embedding_bake.Room(model, np.zeros((0, 12), np.float32))
+
+
+def test_weights_that_were_saved_are_those_that_are_asked(room, tmp_path, monkeypatch):
+    monkeypatch.setattr(weights, "FOLDER", tmp_path)
+    with pytest.raises(UserError, match=r"embedding\.safetensors' are missing"):
+        embedding_bake.network()
+    made = network(networks.SMALL)
+    weights.save(tmp_path / weights.EMBEDDING, {name: value.numpy() for name, value in made.state_dict().items()})
+    np.testing.assert_array_equal(irradiance(embedding_bake.network().cpu(), *room), irradiance(made, *room))
+
+
+def test_without_torch_one_sentence_says_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(UserError, match="needs PyTorch.*pip install torch"):
+        embedding_bake.network()
 
 
 def test_too_large_a_room_is_refused_with_its_size(room, model):
