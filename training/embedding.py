@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -75,8 +76,9 @@ class Sample:
                      ).numpy()
 
 
+@cache
 def load(path: Path, settings: Settings) -> Sample:
-    """A room of the cache."""
+    """A room of the cache, kept in memory."""
     with np.load(path) as found:
         points, queries, irradiance, noise = (
             found[key] for key in ("scene_points", "queries", "irradiance", "noise"))
@@ -92,16 +94,13 @@ def load(path: Path, settings: Settings) -> Sample:
     return Sample(points, queries, irradiance, noise, areas, *unshadowed, layout, near.astype(np.int32))
 
 
-def rooms(cache: Path, split: str, settings: Settings, most: int | None = None) -> list[Sample]:
+def rooms(cache: Path, split: str) -> list[Path]:
     """Those of a split, by name."""
     out = []
     for path in sorted(cache.glob("*.npz")):
-        if len(out) == most:
-            break
         with np.load(path) as found:
-            wanted = str(found["split"]) == split
-        if wanted:
-            out.append(load(path, settings))
+            if str(found["split"]) == split:
+                out.append(path)
     return out
 
 
@@ -174,7 +173,7 @@ BASELINES = {
 }
 
 
-def train(recipe: Recipe, kept: list[Sample], held: list[Sample], seed: int, checkpoint: Path, log: Path) -> Embedding:
+def train(recipe: Recipe, kept: list[Path], held: list[Sample], seed: int, checkpoint: Path, log: Path) -> Embedding:
     """Train, and write log and checkpoint as we go; on from the checkpoint, where there is one of just this."""
     torch.manual_seed(seed)
     model = Embedding(recipe.settings).to(loop.device())
@@ -182,7 +181,7 @@ def train(recipe: Recipe, kept: list[Sample], held: list[Sample], seed: int, che
     def loss_of(model: nn.Module, rng: np.random.Generator) -> Tensor:
         losses = []
         for _ in range(recipe.rooms):
-            sample = kept[rng.integers(len(kept))]
+            sample = load(kept[rng.integers(len(kept))], recipe.settings)
             rows = rng.permutation(len(sample.queries))[:recipe.queries]
             found, truth = answer(model, sample, rows, [int(rng.integers(3))], turn(rng))
             losses.append(relative(found.float(), truth))
@@ -216,7 +215,6 @@ def main() -> None:
     parser.add_argument("--configuration", choices=RECIPES, default="small")
     parser.add_argument("--steps", type=int, help="instead of the configuration's")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--rooms", type=int, help="at most, to train on")
     parser.add_argument("--cache", type=Path, default=CACHE, help="of labelled rooms, from training.room_labels")
     parser.add_argument("--out", type=Path, default=weights.FOLDER, help="folder of the weights")
     arguments = parser.parse_args()
@@ -224,8 +222,8 @@ def main() -> None:
     recipe = RECIPES[arguments.configuration]
     if arguments.steps:
         recipe = Recipe(recipe.settings, arguments.steps, recipe.rate, recipe.rooms, recipe.queries, recipe.every)
-    kept = rooms(arguments.cache, "train", recipe.settings, arguments.rooms)
-    held = rooms(arguments.cache, "validation", recipe.settings)
+    kept = rooms(arguments.cache, "train")
+    held = [load(path, recipe.settings) for path in rooms(arguments.cache, "validation")]
     if not kept or not held:
         parser.error(f"there are too few labelled rooms in '{arguments.cache}'; make them with "
                      "`python -m training.room_labels`")

@@ -49,15 +49,19 @@ def cache(tmp_path_factory):
         split = "train" if seed < 3 else "validation"
         room = box(seed)
         write_npz(folder / f"{split}-{seed}.npz", **room, split=np.array(split))
-        sample = embedding.load(folder / f"{split}-{seed}.npz", TINY)
+        sample = embedding.load.__wrapped__(folder / f"{split}-{seed}.npz", TINY)
         room["irradiance"] = (0.5 * sample.asked + sample.level[:, None]).T.astype(np.float32)
         write_npz(folder / f"{split}-{seed}.npz", **room, split=np.array(split))
     return folder
 
 
+def held_out(cache):
+    path, = embedding.rooms(cache, "validation")
+    return embedding.load(path, TINY)
+
+
 def test_rooms_are_of_their_split(cache):
-    assert [len(embedding.rooms(cache, split, TINY)) for split in ("train", "validation")] == [3, 1]
-    assert len(embedding.rooms(cache, "train", TINY, 2)) == 2
+    assert [len(embedding.rooms(cache, split)) for split in ("train", "validation")] == [3, 1]
 
 
 def losses_of(log):
@@ -70,9 +74,9 @@ class Stopped(Exception):
 
 
 def test_it_learns_and_goes_on_from_its_checkpoint(cache, tmp_path, monkeypatch):
-    kept, held = (embedding.rooms(cache, split, TINY) for split in ("train", "validation"))
-    for sample in (*kept, *held):  # what is not so before training
-        sample.irradiance[:] *= 1.5
+    kept, held = embedding.rooms(cache, "train"), [held_out(cache)]
+    for path in kept:  # what is not so before training
+        embedding.load(path, TINY).irradiance[:] *= 1.5
     whole = embedding.train(RECIPE, kept, held, 3, tmp_path / "one", tmp_path / "one.csv")
     losses = losses_of(tmp_path / "one.csv")
     assert len(losses) == 2 and losses[1] < losses[0]
@@ -95,7 +99,7 @@ def test_training_asks_as_the_bake_does(cache):
     torch.manual_seed(0)
     model = Embedding(TINY).eval()
     torch.nn.init.normal_(model.decoder.leave.weight, std=0.5)
-    sample, = embedding.rooms(cache, "validation", TINY)
+    sample = held_out(cache)
     queries = sample.queries[embedding.held_rows(sample)]
     baked = methods.run(embedding_bake.Room(model, sample.points).irradiance(queries))
     np.testing.assert_allclose(embedding.network(model, sample), baked, rtol=1e-3)
@@ -105,7 +109,7 @@ def test_light_does_not_change_as_a_room_is_turned(cache):
     """What a turn must keep: the truth, and what an untrained network gives, which sees no directions."""
     torch.manual_seed(0)
     model, rng = Embedding(TINY).eval(), np.random.default_rng(0)
-    sample, = embedding.rooms(cache, "validation", TINY)
+    sample = held_out(cache)
     rows = np.arange(50)
     found = []
     for matrix in (np.eye(3), embedding.turn(rng), embedding.turn(rng)):
@@ -120,7 +124,7 @@ def test_light_does_not_change_as_a_room_is_turned(cache):
 
 
 def test_errors_are_those_of_equation_12(cache):
-    sample, = embedding.rooms(cache, "validation", TINY)
+    sample = held_out(cache)
     truth = sample.irradiance[embedding.held_rows(sample)]
     assert embedding.judged(truth, sample) == {"log_l2": 0, "rel_mse": 0}
     found = embedding.judged(1.5 * truth, sample)
@@ -130,7 +134,7 @@ def test_errors_are_those_of_equation_12(cache):
 
 
 def test_the_table_has_a_row_of_the_network_and_of_each_baseline(cache):
-    sample, = embedding.rooms(cache, "validation", TINY)
+    sample = held_out(cache)
     flat = replace(sample, irradiance=np.ones_like(sample.irradiance))
     lines = embedding.table(Embedding(TINY).eval(), [flat]).splitlines()
     assert len(lines) == 3 + len(embedding.BASELINES)
