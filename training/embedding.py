@@ -146,10 +146,19 @@ def held_rows(sample: Sample) -> NDArray:
 
 
 def judged(found: NDArray, sample: Sample) -> dict[str, float]:
-    """Errors of irradiance (n, 3) at `held_rows`: equation 12, and squared error over squared irradiance."""
+    """Errors of irradiance (n, 3) at `held_rows`.
+
+    Squared error over squared truth, of logarithms and of irradiance itself, which is mostly what is beside lamps; and
+    equation 12, which forgives what is too bright and not what is too dark, as it divides by what was found.
+    """
     truth, unit = sample.irradiance[held_rows(sample)], sample.level.clip(1e-30)
-    logs = (torch.from_numpy(np.log1p(each / unit)) for each in (found, truth))
-    return {"log_l2": float(relative(*logs)), "rel_mse": float(np.square(found - truth).sum() / np.square(truth).sum())}
+    logs = [np.log1p(each / unit) for each in (found, truth)]
+    return {"log_mse": _share(*logs), "rel_mse": _share(found, truth),
+            "equation_12": float(relative(*map(torch.from_numpy, logs)))}
+
+
+def _share(found: NDArray, truth: NDArray) -> float:
+    return float(np.square(found - truth).sum() / np.square(truth).sum())
 
 
 def network(model: nn.Module, sample: Sample) -> NDArray:
@@ -189,9 +198,7 @@ def train(recipe: Recipe, kept: list[Path], held: list[Sample], seed: int, check
 
     def look(model: nn.Module) -> dict[str, float]:
         found = [judged(network(model, sample), sample) for sample in held]
-        return {"log_l2": float(np.mean([each["log_l2"] for each in found])),
-                "rel_mse_median": float(np.median([each["rel_mse"] for each in found])),
-                "rel_mse_mean": float(np.mean([each["rel_mse"] for each in found]))}
+        return {name: float(np.mean([each[name] for each in found])) for name in found[0]}
 
     return loop.run(model, loss_of, look, steps=recipe.steps, rate=recipe.rate, every=recipe.every, seed=seed,
                     checkpoint=checkpoint, log=log)
@@ -199,14 +206,19 @@ def train(recipe: Recipe, kept: list[Path], held: list[Sample], seed: int, check
 
 def table(model: nn.Module, held: list[Sample]) -> str:
     """The network beside what needs no training, and the noise of the truth."""
-    lines = [f"{'':46}{'log L2':>8}{'rel. MSE: median':>18}{'mean':>8}"]
+    lines = [f"{'mean of the rooms, and in brackets the median':46}{'log MSE':>16}{'rel. MSE':>18}{'equation 12':>18}"]
+
+    def row(name: str, *columns: list[float]) -> str:
+        return f"{name:46}" + "".join(f"{np.mean(each):9.4f} ({np.median(each):.4f})" for each in columns)
+
     for name, give in {"network": lambda sample: network(model, sample), **BASELINES}.items():
         found = [judged(give(sample), sample) for sample in held]
-        errors = [each["rel_mse"] for each in found]
-        lines.append(f"{name:46}{np.mean([each['log_l2'] for each in found]):8.4f}{np.median(errors):18.4f}"
-                     f"{np.mean(errors):8.4f}")
-    noise = [float(np.square(sample.noise).sum() / np.square(sample.irradiance).sum()) for sample in held]
-    return "\n".join([*lines, f"{'noise of the truth':46}{'':8}{np.median(noise):18.4f}{np.mean(noise):8.4f}"])
+        lines.append(row(name, *([each[key] for each in found] for key in found[0])))
+    noisy = [(sample.irradiance[held_rows(sample)], sample.noise[held_rows(sample)], sample.level) for sample in held]
+    lines.append(row("noise of the truth", [_share(np.log1p(truth / unit) + noise / (truth + unit),
+                                                   np.log1p(truth / unit)) for truth, noise, unit in noisy],
+                     [_share(truth + noise, truth) for truth, noise, _ in noisy]))
+    return "\n".join(lines)
 
 
 def main() -> None:
@@ -232,7 +244,7 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     weights.save(arguments.out / weights.EMBEDDING,
                  {name: value.cpu().numpy() for name, value in model.state_dict().items()})
-    draw(log, ["loss", "log_l2", "rel_mse_median"])
+    draw(log, ["loss", "log_mse", "rel_mse"])
     print(f"{len(kept)} rooms, {len(held)} held out\n{table(model, held)}")
 
 
