@@ -3,12 +3,13 @@
 # make test   run the tests
 # make test-window BLENDER=…   try the panel and the bake in an open Blender (see tests/window/session.py)
 # make data    label meshes to train on, in training/cache/ (COUNT=2000 SEED=1 FOLDER=… for more)
+# make rooms   label rooms for the light transport embedding, in training/cache/rooms/ (MESHES=… for some in them)
 # make chart  error against time of every method, in docs/chart (QUICK=1: a small one, in out/chart)
 # make planner  what the planner picks, beside the cheapest plan that meets the tolerance
 # make stability  where methods fail: a table, in docs/stability.md (QUICK=1: a small one, printed)
 # make train NETWORK=gnn   label meshes and train from nothing: gnn, hybrid, gnn-paper, mlp, end-to-end or student
 # make lint, package, bench, docs-pictures, clean: as they say
-.PHONY: chart data train demo docs-pictures planner stability test test-window lint package bench clean system-packages
+.PHONY: chart data rooms train demo docs-pictures planner stability test test-window lint package bench clean system-packages
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 PY := .venv/bin/python
 # Debian's names of what bpy loads; EEVEE renders without a display through EGL and llvmpipe
@@ -68,6 +69,9 @@ COUNT ?= 2000
 SEED ?= 1
 data: .venv/ready
 	$(PY) -m training.data --count $(COUNT) --seed $(SEED) $(if $(FOLDER),--folder "$(FOLDER)")
+
+rooms: .venv/ready
+	$(PY) -m training.room_labels $(if $(MESHES),--meshes "$(MESHES)")
 
 NETWORK ?= gnn
 train: data

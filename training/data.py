@@ -115,11 +115,11 @@ def work(job: Job, path: Path) -> Outcome:
     return Outcome(job, len(sample.positions), made - began, time.perf_counter() - made, "")
 
 
-def is_whole(path: Path) -> bool:
+def is_whole(path: Path, keys: Sequence[str] = (*labels.ARRAYS, *labels.TEXTS)) -> bool:
     """Whether a file was written to its end: what a zip holds is listed there."""
     try:
         with zipfile.ZipFile(path) as archive:
-            return {f"{key}.npy" for key in (*labels.ARRAYS, *labels.TEXTS)} <= set(archive.namelist())
+            return {f"{key}.npy" for key in keys} <= set(archive.namelist())
     except (OSError, zipfile.BadZipFile):
         return False
 
@@ -140,7 +140,7 @@ def prepare(jobs: Sequence[Job], cache: Path = CACHE, workers: int = 2, quiet: b
     done: list[Outcome] = []
     points, began = 0, time.perf_counter()
     with tqdm(total=len(jobs), initial=len(jobs) - len(missing), unit="mesh", disable=quiet, smoothing=0.1) as bar:
-        for outcome in _outcomes(missing, workers):
+        for outcome in outcomes(work, missing, workers):
             done.append(outcome)
             points += outcome.points
             bar.set_postfix_str(f"{points / (time.perf_counter() - began):,.0f} points/s", refresh=False)
@@ -151,8 +151,11 @@ def prepare(jobs: Sequence[Job], cache: Path = CACHE, workers: int = 2, quiet: b
     return [path for job, path in zip(jobs, paths, strict=True) if id(job) not in failed], done
 
 
-def _outcomes(missing: Sequence[tuple[Job, Path]], workers: int) -> Iterator[Outcome]:
-    """Outcomes as they come. Closing the iterator drops what has not begun."""
+def outcomes(work: Callable[..., Any], missing: Sequence[tuple[Any, Path]], workers: int) -> Iterator[Any]:
+    """What `work(job, path)` gives, as it comes, in processes or (0) in this one. Closing drops what has not begun.
+
+    An outcome names its job in `job`.
+    """
     if not workers or not missing:
         yield from (work(job, path) for job, path in missing)
         return

@@ -122,9 +122,9 @@ def columns(rng: Rng, target: int) -> Mesh:
     return merge(parts)
 
 
-def _furniture(rng: Rng) -> Mesh:
-    """A table, chair, shelf, lamp, cupboard or sofa that stands on z = 0, about 1 wide."""
-    kind = rng.choice(["table", "chair", "shelf", "lamp", "cupboard", "sofa"])
+def furniture(rng: Rng) -> tuple[str, list[Mesh]]:
+    """Which of table, chair, shelf, lamp, cupboard or sofa it is, and its parts: stands on z = 0, about 1 wide."""
+    kind = str(rng.choice(["table", "chair", "shelf", "lamp", "cupboard", "sofa"]))
     if kind in ("table", "chair"):
         high, leg = (0.7, 0.06) if kind == "table" else (0.45, 0.05)
         wide, deep = (1.2, 0.7) if kind == "table" else (0.5, 0.5)
@@ -149,7 +149,7 @@ def _furniture(rng: Rng) -> Mesh:
     else:
         parts = [box((1.6, 0.8, 0.35), (0, 0, 0.2)), box((1.6, 0.2, 0.5), (0, 0.35, 0.6)),
                  *(box((0.2, 0.8, 0.3), (x * 0.8, 0, 0.5)) for x in (-1, 1))]
-    return merge(parts)
+    return kind, parts
 
 
 def room(rng: Rng, target: int) -> Mesh:
@@ -168,7 +168,7 @@ def room(rng: Rng, target: int) -> Mesh:
                   *(box((0.1, y / 4, z), (-x / 2 - 0.05, s * 0.375 * y, z / 2)) for s in (-1, 1))]
     for _ in range(int(rng.integers(2, 7))):
         at = (*(rng.uniform(-0.5, 0.5, 2) * np.maximum(np.array([x, y]) - 1.1, 0.2)), 0.001)
-        parts.append(place(_furniture(rng), at, about("z", np.pi / 2 * int(rng.integers(4)))))
+        parts.append(place(merge(furniture(rng)[1]), at, about("z", np.pi / 2 * int(rng.integers(4)))))
     return merge(parts)
 
 

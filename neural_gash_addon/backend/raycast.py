@@ -70,7 +70,7 @@ class Occluders:
                 number[here] = np.arange(len(here), dtype=np.int32)
                 EmbreeMesh(self._scene, self.normalise(positions[here]), number[piece])
             before += len(triangles)
-        self._first = np.array(first, dtype=np.int64)
+        self._first = np.array([*first, 0], dtype=np.int64)
         # the first query commits the scene, which only one thread may do
         self.blocked(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))
 
@@ -85,17 +85,27 @@ class Occluders:
         coarser = np.maximum(1.0, 2.0 * np.abs(local).max(1, keepdims=True, initial=0.0))
         return (local + self.offset * coarser * clearance).astype(np.float32)
 
-    def blocked(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.int32]:
-        """0 where a ray is blocked, -1 where it is free. Both (R, 3) float32, contiguous. Releases the GIL."""
-        return self._scene.run(origins, directions, query="OCCLUDED")
+    def blocked(self, origins: NDArray[np.float32], directions: NDArray[np.float32],
+                reach: NDArray[np.float32] | None = None) -> NDArray[np.int32]:
+        """0 where a ray is blocked, -1 where it is free. Both (R, 3) float32, contiguous. Releases the GIL.
+
+        reach: (R,) how far along it, in lengths of its direction; to the end of the scene where not given.
+        """
+        return self._scene.run(origins, directions, reach, query="OCCLUDED")
 
     def hits(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> Hits:
         """The first triangle that each ray (R, 3) meets. Releases the GIL."""
+        faces, u, v, normals = self.first(origins, directions)
+        rays = np.flatnonzero(faces >= 0)
+        front = np.einsum("rx,rx->r", normals[rays], directions[rays]) < 0
+        return Hits(rays, faces[rays], u[rays], v[rays], front)
+
+    def first(self, origins: NDArray[np.float32], directions: NDArray[np.float32]
+              ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """As `hits`, of every ray: triangle (R,), -1 where it meets none, u and v (R,), its normal (R, 3), not unit."""
         found = self._scene.run(origins, directions, query="INTERSECT", output=True)
-        rays = np.flatnonzero(found["primID"] >= 0)
-        faces = self._first[found["geomID"][rays]] + found["primID"][rays]
-        front = np.einsum("rx,rx->r", found["Ng"][rays], directions[rays]) < 0
-        return Hits(rays, faces, found["u"][rays], found["v"][rays], front)
+        faces = self._first[found["geomID"]] + found["primID"]  # nothing is -1 and -1, and the last row holds 0
+        return faces, found["u"], found["v"], found["Ng"]
 
 
 def _used(positions: NDArray, triangles: NDArray) -> NDArray[np.int64]:

@@ -77,3 +77,22 @@ def frames(normals: NDArray, angles: NDArray) -> NDArray[np.float64]:
     second = np.stack([b, sign + y * y * a, -y], 1)
     c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]
     return np.stack([c * first + s * second, c * second - s * first, np.stack([x, y, z], 1)], 2)
+
+
+def on_triangles(cumulative: NDArray, pairs: NDArray) -> tuple[NDArray[np.int64], NDArray, NDArray]:
+    """Points of triangles, chosen by weight and uniform within each; nets stay stratified over all of them.
+
+    Args:
+        cumulative: (F,) sums of the triangles' weights up to and with each one; the last is positive.
+        pairs: (2, n) uniform in 0 to 1, of the same dtype. The first chooses the triangle, and what is left of it
+            the place.
+    Returns:
+        Triangles (n,), of positive weight, and barycentric coordinates u, v (n,) of their second and third corner.
+    """
+    at = pairs[0] * cumulative[-1]
+    last = np.searchsorted(cumulative, cumulative[-1])  # of positive weight
+    faces = np.minimum(np.searchsorted(cumulative, at, side="right"), last)
+    before = np.concatenate([np.zeros(1, cumulative.dtype), cumulative[:-1]])[faces]
+    root = np.sqrt(np.clip((at - before) / (cumulative[faces] - before), 0, 1))
+    v = root * pairs[1]
+    return faces, root - v, v
