@@ -3,8 +3,8 @@
 
 Balanced trees of boxes, halved along their longest side (Friedman, Bentley & Finkel 1977, "An algorithm for finding
 best matches in logarithmic expected time"), all leaves of one size, so that each step is one of whole arrays. The
-places are gathered in leaves of their own. Some leaf of points lies by each of those; a place's k-th nearest point in
-it is at least as far as its k-th of all; whatever box is nearer than that is searched. A grid of cells would be
+places are gathered in leaves of their own. Each place is in the part of space of some leaf of points; its k-th nearest
+of these is at least as far as its k-th of all; whatever box is nearer than that is searched. A grid of cells would be
 simpler, but meshes have a detailed part on a large ground, and there its cells hold too many points or none.
 """
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _POINTS = 1024  # searched at a time: what is compared with them stays in the cache
+_TIE = 2.0 ** -20  # of the second longest side, which parts points that are level along the longest
 _LEAF = 16      # places of a leaf, at least half of it: of few, the boxes are small
 
 Floats = NDArray[np.float64]
@@ -59,7 +60,7 @@ class _Tree:
         self.count = len(points)
         # half of a leaf of twice that may be copies
         depth = max(int(np.ceil(np.log2(len(points) / (4 * least)))), 0)
-        self.order = _leaves(points, depth)                            # (leaves, M)
+        self.order, self.splits = _leaves(points, depth)  # (leaves, M)
         # points that fill the last slots of leaves are copies, and are never found
         self.copy = self.order >= len(points)
         self.order[self.copy] -= len(points)
@@ -71,18 +72,28 @@ class _Tree:
             self.high.append(self.high[-1].reshape(3, -1, 2).max(2))
 
 
-def _leaves(points: Floats, depth: int) -> Indices:
-    """(2**depth, M) indices of points, halved `depth` times. Those of N and above are copies of those N below."""
+def _leaves(points: Floats, depth: int) -> tuple[Indices, list[tuple[Indices, Indices, Floats]]]:
+    """(2**depth, M) indices of points, halved `depth` times. Those of N and above are copies of those N below.
+
+    And of each step, for each box: its longest side, the next one, and the `_key` at which the upper half begins.
+    """
     size = -(-len(points) // 2 ** depth)
-    order = np.arange(size * 2 ** depth)[None]
+    order, splits = np.arange(size * 2 ** depth)[None], []
     filled = np.concatenate([points, points[:order.size - len(points)]])
     for _ in range(depth):
         inside = filled[order]
-        axis = (inside.max(1) - inside.min(1)).argmax(1)
-        along = np.take_along_axis(inside, axis[:, None, None], 2)[..., 0]
+        next_, axis = (inside.max(1) - inside.min(1)).argsort(1)[:, 1:].T
+        key = _key(*(np.take_along_axis(inside, each[:, None, None], 2)[..., 0] for each in (axis, next_)))
         half = order.shape[1] // 2
-        order = np.take_along_axis(order, np.argpartition(along, half, axis=1), 1).reshape(-1, half)
-    return order
+        parted = np.argpartition(key, half, axis=1)
+        splits.append((axis, next_, np.take_along_axis(key, parted[:, half:half + 1], 1)[:, 0]))
+        order = np.take_along_axis(order, parted, 1).reshape(-1, half)
+    return order, splits
+
+
+def _key(along: Floats, across: Floats) -> Floats:
+    """What points are halved by. Walls and floors have many level points, which must not be on both sides all over."""
+    return along + _TIE * across
 
 
 def _search(asking: _Tree, tree: _Tree, k: int) -> Indices:
@@ -111,21 +122,20 @@ def _search(asking: _Tree, tree: _Tree, k: int) -> Indices:
 
 
 def _home(asking: _Tree, tree: _Tree) -> Indices:
-    """A leaf of points near each leaf of places: from the root, always into the box that is nearer its centre."""
-    middle = (asking.low[0] + asking.high[0]) / 2
-    box = np.zeros(middle.shape[1], dtype=np.int64)
-    for lower, upper in zip(tree.low[-2::-1], tree.high[-2::-1], strict=True):
-        left, right = (_square(*_gap(middle, middle, lower[:, child], upper[:, child]))
-                       for child in (2 * box, 2 * box + 1))
-        box = 2 * box + (right < left)
+    """The leaf of points in whose part of space each place is: (leaves of places, m)."""
+    places = np.stack(asking.places)
+    box = np.zeros(places.shape[1:], dtype=np.int64)
+    row, member = np.indices(box.shape)
+    for axis, next_, at in tree.splits:
+        key = _key(places[axis[box], row, member], places[next_[box], row, member])
+        box = 2 * box + (key >= at[box])
     return box
 
 
 def _within(here: list[Floats], tree: _Tree, home: Indices, k: int) -> Floats:
-    """Squared distance of each place of some leaves to the k-th point in the leaf by theirs: (L, m)."""
-    square = _square(*(mine[:, :, None] - there[home][:, None, :]
-                       for mine, there in zip(here, tree.places, strict=True)))
-    square[np.broadcast_to(tree.copy[home][:, None, :], square.shape)] = np.inf
+    """Squared distance of each place of some leaves to the k-th point in the leaf that is its home: (L, m)."""
+    square = _square(*(mine[:, :, None] - there[home] for mine, there in zip(here, tree.places, strict=True)))
+    square[tree.copy[home]] = np.inf
     square.partition(k - 1, axis=2)
     return square[..., k - 1]
 
