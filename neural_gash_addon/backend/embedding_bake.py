@@ -17,10 +17,12 @@ QUERIES_AT_ONCE = 4096  # decoded together, so that memory does not grow with th
 
 
 def network() -> Any:
-    """The network that ships: networks.embedding.Embedding, on the GPU where there is one, in `eval` mode.
+    """The trained network: networks.embedding.Embedding, on the GPU where there is one, in `eval` mode.
+
+    None ships yet (docs/embedding.md says why); `python -m training.embedding` writes one.
 
     Raises:
-        UserError: no torch, or weights that are not those that were shipped.
+        UserError: no torch, or no weights, or not those that were trained.
     """
     torch = import_torch("embedding")
     from .networks.embedding import SMALL, Embedding
