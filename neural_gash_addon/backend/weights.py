@@ -20,7 +20,7 @@ from .exchange import atomic
 from .hybrid import Layer, Network
 
 FOLDER = Path(__file__).parent / "networks"
-HYBRID, GNN = "hybrid.safetensors", "gnn.safetensors"
+HYBRID, GNN, EMBEDDING = "hybrid.safetensors", "gnn.safetensors", "embedding.safetensors"
 CHECKSUMS = "checksums.json"  # file name -> SHA-256, beside the weights
 
 

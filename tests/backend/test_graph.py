@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from neural_gash_addon.backend.geometry import TriangleMesh
 from neural_gash_addon.backend.graph import graph
-from neural_gash_addon.backend.nearest import nearest
+from neural_gash_addon.backend.nearest import nearest, nearest_to
 from neural_gash_addon.backend.neighbours import Neighbours, neighbours
 
 from . import shapes
@@ -32,6 +32,29 @@ def test_nearest_are_those_of_a_k_d_tree(name):
     expected = cKDTree(places).query(places, k + 1)[0][:, 1:]
     np.testing.assert_allclose(distance, expected.reshape(distance.shape), rtol=1e-9)
     assert (np.diff(distance, axis=1) >= 0).all()
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+@pytest.mark.parametrize("other", ["sphere", "nine", "clusters", "far"])
+def test_nearest_to_places_are_those_of_a_k_d_tree(name, other):
+    places, points = CLOUDS[name], CLOUDS[other]
+    k = min(16, len(points))
+    found = nearest_to(places, points, 16)
+    assert found.shape == (len(places), k)
+    distance = np.linalg.norm(points[found] - places[:, None], axis=2)
+    np.testing.assert_allclose(distance, cKDTree(points).query(places, k)[0], rtol=1e-9)
+    assert (np.diff(distance, axis=1) >= -1e-12 * distance.max()).all()
+
+
+def test_of_points_equally_near_the_lower_index_is_first():
+    np.testing.assert_array_equal(nearest_to(np.ones((3, 3)), np.zeros((500, 3)), 5), [np.arange(5)] * 3)
+    grid = np.stack(np.meshgrid(*[np.arange(9.0)] * 3), -1).reshape(-1, 3)
+    square = np.square(grid[:, None] - grid[None]).sum(2)
+    np.testing.assert_array_equal(nearest_to(grid, grid, 20), np.argsort(square, axis=1, kind="stable")[:, :20])
+
+
+def test_no_places_have_no_nearest():
+    assert nearest_to(np.zeros((0, 3)), np.zeros((4, 3)), 8).shape == (0, 4)
 
 
 def edges(found):
