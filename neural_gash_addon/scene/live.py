@@ -53,6 +53,7 @@ _followers: dict[int, _Follower] = {}        # by session uid of the object
 _problems: dict[int, str] = {}               # why an object is not followed
 _sequences: dict[str, tuple[float, Sequence]] = {}  # path -> when the file was written, and the file
 _shown: dict[int, frozenset[int]] = {}       # session uid of a scene -> its objects that are shown, when last looked at
+_LIVE = "Live."  # with which the plan of a bake begins that was made within the budget
 _suspended = False                           # something else bakes frame by frame
 _rendering = False
 
@@ -166,7 +167,8 @@ def _update(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types.
     before = _followable(obj)
     began = time.perf_counter()
     now = fingerprint(obj, depsgraph, before.occluders)
-    if same_fingerprint(now, before.fingerprint):
+    hurried = before.plan.startswith(_LIVE)  # by an update in the window
+    if same_fingerprint(now, before.fingerprint) and not (rendered and hurried):
         return False
     follower = _followers.setdefault(obj.session_uid, _Follower())
     if rendered:
@@ -189,7 +191,7 @@ def _update(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types.
         transfer = Transfer(found, BakeRecord(
             method=plan.method, order=before.order, points=len(mesh.points), domain=mesh.domain,
             rays=(plan.rays or 0) * plan.points, seed=0, seconds=took, error_estimate=plan.error,
-            plan=f"Live. {_sentence(plan, took, follower.budget)}"))
+            plan=f"{_LIVE} {_sentence(plan, took, follower.budget)}"))
     frame = tuple(float(v) for v in rotation_part(matrix).ravel())
     record = replace(transfer.record, occluders=before.occluders, fingerprint=now, frame=frame)
     write_transfer(obj, mesh.elements, replace(transfer, record=record))

@@ -152,11 +152,20 @@ def test_live_keeps_to_its_plan_and_is_near_the_truth(wing, settings):
     assert staleness.check(wing)
 
 
-def test_what_fits_is_left_alone(wing, settings, monkeypatch):
+def test_a_frame_that_the_window_showed_is_baked_anew_to_be_rendered(wing, settings):
     settings.live = True
     with live.suspended():
-        bpy.context.scene.frame_set(5)
+        bpy.context.scene.frame_set(9)
     follow(wing)
+    assert attributes.read_record(wing).plan.startswith("Live.")
+    bpy.context.scene.frame_set(9)  # in background, as in a render
+    same(stored(wing), baked(wing, settings)[0])
+    assert not attributes.read_record(wing).plan
+
+
+def test_what_fits_is_left_alone(wing, settings, monkeypatch):
+    settings.live = True
+    bpy.context.scene.frame_set(5)
     written = []
     monkeypatch.setattr(live, "write_transfer", lambda *a: written.append(a))
     follow(wing)
