@@ -18,9 +18,10 @@ from ..backend.errors import UserError
 from ..backend.geometry import TEXEL, TriangleMesh
 from ..backend.methods import METHODS
 from ..backend.record import BakeRecord
+from ..scene import staleness
 from ..scene.attributes import has_bake, read_record, read_transfer
 from ..scene.comparison import check_errors, write_errors
-from ..scene.read import fingerprint, read_object, read_occluders, same_fingerprint
+from ..scene.read import read_object, read_occluders
 from ..scene.views import show_errors
 from .bake import Baking, bake_refusal
 from .job import percent
@@ -76,7 +77,7 @@ class NEURAL_GASH_OT_show_confidence(Baking, bpy.types.Operator):
             raise UserError(f"Confidence is for bakes to vertices without bounces, which that of '{obj.name}' is not.")
         check_errors(obj)
         depsgraph = context.evaluated_depsgraph_get()
-        if not same_fingerprint(fingerprint(obj, depsgraph, record.occluders), record.fingerprint):
+        if not staleness.same(obj, record):
             raise UserError(f"'{obj.name}' has changed since the bake; bake it first.")
         read = read_object(obj, depsgraph)
         values, _ = read_transfer(obj)

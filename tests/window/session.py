@@ -28,6 +28,7 @@ import numpy as np
 from mathutils import Euler
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
+from following import following
 from likeness import LARGEST, differences
 from moments import moments
 
@@ -186,9 +187,7 @@ def session():
     yield from build()
     yield from cancelled()
     yield from baked()
-    yield from followed()
-    yield from turned()
-    yield from lived()
+    yield from following(SimpleNamespace(**globals()))
     yield from reopened()
     yield from textured()
     yield from deleted()
@@ -313,94 +312,6 @@ def baked():
     yield 2
     yield from picture("6_turned")
     settings().light_rotation = 0.0
-
-
-def followed():
-    """The sun is turned, the World made brighter, and both undone: the preview follows on its own."""
-    sun = next(o for o in bpy.data.objects if o.type == "LIGHT")
-    strength = bpy.context.scene.world.node_tree.nodes["Background"].inputs["Strength"]
-    first = light()
-    with in_view():
-        bpy.ops.ed.undo_push(message="Before the sun is turned")
-    for angle in np.linspace(0.6, -0.9, 9)[1:]:
-        sun.rotation_euler[0] = float(angle)
-        yield 0.1
-    turned = light()
-    expect(not np.allclose(turned, first), "a_sun_is_followed")
-    strength.default_value = 8.0
-    yield 0.3
-    expect(not np.allclose(light(), turned), "the_world_is_followed")
-    yield 2
-    yield from picture("6b_followed")
-    with in_view():
-        bpy.ops.ed.undo_push(message="Sun turned")
-    press("Z", ctrl=True)
-    yield 1.0
-    expect(np.allclose(light(), first, atol=1e-5), "undo_takes_the_light_back")
-    view3d()[1].spaces.active.shading.type = "SOLID"
-
-
-def turned():
-    """The HDRI of the viewport is turned by its own option: the light of the preview turns with it."""
-    before = light()
-    settings().with_viewport = True
-    shading = view3d()[1].spaces.active.shading
-    shading.studiolight_rotate_z = 0.7
-    yield 0.5
-    expect(abs(settings().light_rotation + 0.7) < 1e-5, "the_viewport_turns_the_light")
-    expect(not np.allclose(light(), before), "and_the_preview")
-    settings().with_viewport = False
-    shading.studiolight_rotate_z = 0.0
-    yield 0.5
-    expect(abs(settings().light_rotation + 0.7) < 1e-5, "only_where_asked_for")
-    settings().light_rotation = 0.0
-    yield 0.2
-
-
-def lived():
-    """Live: what a modifier does to the head is followed while a value is dragged, and while the animation plays."""
-    live, staleness = (sys.modules[f"{ID}.scene.{name}"] for name in ("live", "staleness"))
-    head, scene = suzanne(), bpy.context.scene
-    twist = head.modifiers.new("Twist", "SIMPLE_DEFORM")
-    twist.deform_method, twist.angle = "TWIST", 0.0
-    settings().live = True
-    yield 1.0
-    expect("ms; error about" in live.status(head) and not live.problem(head), "live_says_what_it_does")
-    facts["live"] = live.status(head)
-    took, before = [], coefficients()
-    for angle in np.linspace(0.1, 1.6, 12):
-        twist.angle = float(angle)
-        yield 0.05
-        took.append(live._followers[head.session_uid].seconds)
-        expect(not np.array_equal(coefficients(), before), "live_follows_a_drag")
-        before = coefficients()
-    facts["live_drag_ms"] = round(1000 * float(np.median(took)), 1)
-    yield 1.0
-    expect(staleness.status(head) == staleness.CURRENT, "live_is_up_to_date")
-    yield from picture("6c_live")
-    for frame, angle in ((1, 0.0), (24, 1.6)):
-        twist.angle = angle
-        twist.keyframe_insert("angle", frame=frame)
-    scene.frame_start, scene.frame_end = 1, 24
-    with in_view():
-        bpy.ops.screen.animation_play()
-    seen = set()
-    until = time.perf_counter() + 3
-    while time.perf_counter() < until:
-        seen.add(coefficients().tobytes())
-        yield 0.05
-    with in_view():
-        bpy.ops.screen.animation_cancel()
-    facts["live_frames_seen"] = len(seen)
-    expect(len(seen) > 2, "live_follows_playback")  # software GL draws few frames a second
-    settings().live = False
-    head.modifiers.remove(twist)
-    head.animation_data_clear()
-    scene.frame_set(1)
-    with in_view():
-        bpy.ops.ed.undo_push(message="Live over")
-    expect(bpy.ops.neural_gash.bake() == {"FINISHED"}, "baked_after_live")
-    yield 0.5
 
 
 def reopened():
