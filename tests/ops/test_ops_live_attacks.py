@@ -277,6 +277,41 @@ def test_colliding_names(sheet, settings, tmp_path):
     assert files[0] != files[1] or files[1] is None
 
 
+def test_each_blend_has_its_own(sheet, settings, tmp_path):
+    """Two files with objects of the same name, sequences in the same folder."""
+    scene = bpy.context.scene
+    select(sheet())
+    settings.sequence_folder = "//"
+    for name in ("one", "two"):
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / f"{name}.blend"))
+        scene = bpy.context.scene
+        scene.frame_end = 1 if name == "two" else 3
+        bpy.context.view_layer.objects.active = bpy.data.objects["Sheet"]
+        assert bpy.ops.neural_gash.bake_sequence() == {"FINISHED"}
+        bpy.ops.wm.save_mainfile()
+    assert sorted(path.name for path in tmp_path.glob("*.prtseq")) == ["one-Sheet.prtseq", "two-Sheet.prtseq"]
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "one.blend"))
+    bpy.context.scene.frame_set(3)
+    assert staleness.status(bpy.data.objects["Sheet"]) == staleness.CURRENT
+
+
+def test_disabled_during_a_sequence(sheet, settings, tmp_path, addon, capfd):
+    """Nothing is left of it: no file, and the scene at its frame."""
+    obj = sheet()
+    settings.sequence_folder = str(tmp_path)
+    bpy.context.scene.frame_set(2)
+    baking = bake_sequence(bpy.context, [obj])
+    while next(baking) < 0.5:
+        pass
+    addon.unregister()
+    try:
+        baking.close()
+        assert not list(tmp_path.iterdir()) and bpy.context.scene.frame_current == 2 and not live._suspended
+    finally:
+        addon.register()
+    quiet(capfd)
+
+
 def test_twins(sheet, settings, tmp_path):
     one = sheet("One")
     two = bpy.data.objects.new("Two", one.data)
