@@ -5,6 +5,7 @@ Part of `session.py`, whose module is handed over as `s`.
 """
 from __future__ import annotations
 
+import tempfile
 import threading
 
 import bpy
@@ -14,7 +15,8 @@ def moments(s):
     """All of them."""
     yield from loaded(s)
     yield from closed(s)
-    yield from disabled(s)
+    yield from disabled(s, long_bake)
+    yield from disabled(s, long_sequence)
 
 
 def left_behind(s) -> dict:
@@ -38,6 +40,15 @@ def long_bake(s, window=None) -> None:
         settings = window.scene.neural_gash
         settings.method, settings.quality, settings.rays = "embree", "RAYS", s.MANY_RAYS
         s.expect(bpy.ops.neural_gash.bake("INVOKE_DEFAULT") == {"RUNNING_MODAL"}, "a_long_bake_begins")
+
+
+def long_sequence(s) -> None:
+    """A sequence of the same ball that does not end by itself."""
+    with s.in_view():
+        settings = bpy.context.scene.neural_gash
+        settings.sequence_folder = tempfile.mkdtemp()
+        settings.method, settings.quality, settings.rays = "embree", "RAYS", s.MANY_RAYS
+        s.expect(bpy.ops.neural_gash.bake_sequence("INVOKE_DEFAULT") == {"RUNNING_MODAL"}, "a_long_sequence_begins")
 
 
 def gone(s, name: str):
@@ -76,11 +87,11 @@ def closed(s):
     s.expect(len(bpy.context.window_manager.windows) == 1, "one_window_again")
 
 
-def disabled(s):
+def disabled(s, begin):
     """The add-on is disabled while a bake runs and Live is on, and enabled again."""
     before = left_behind(s)
     bpy.context.scene.neural_gash.live = True
-    long_bake(s)
+    begin(s)
     yield 1.0
     state = s.state()
     bpy.ops.preferences.addon_disable(module=s.ID)
