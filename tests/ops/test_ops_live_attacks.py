@@ -239,6 +239,29 @@ def test_a_problem_stays_said_while_others_change(sheet, make, settings):
     assert "change its vertices" in live.problem(obj)
 
 
+@pytest.mark.parametrize("where", ["fingerprint", "write_transfer"])
+def test_a_frame_change_during_an_update(sheet, settings, monkeypatch, capfd, where):
+    """By another add-on's handler or a script: before anything was read, and before it is written."""
+    obj = sheet()
+    bake(obj)
+    settings.live = True
+    real, again = getattr(live, where), []
+
+    def busy(*args, **kwargs):
+        if not again:
+            again.append(bpy.context.scene.frame_current)
+            bpy.context.scene.frame_set(3)
+        return real(*args, **kwargs)
+    monkeypatch.setattr(live, where, busy)
+    bpy.context.scene.frame_set(2)
+    assert again == [2] and bpy.context.scene.frame_current == 3
+    monkeypatch.setattr(live, where, real)
+    bpy.context.scene.frame_set(3)
+    np.testing.assert_allclose(stored(obj), truth(obj, settings), atol=1e-6)
+    assert staleness.status(obj) == staleness.CURRENT and not live.problem(obj)
+    quiet(capfd)
+
+
 def test_live_switched_on_during_a_sequence(sheet, settings, tmp_path):
     obj = sheet()
     bake(obj)

@@ -5,6 +5,8 @@ Part of `session.py`, whose module is handed over as `s`.
 """
 from __future__ import annotations
 
+import inspect
+import sys
 import tempfile
 import threading
 
@@ -20,10 +22,13 @@ def moments(s):
 
 
 def left_behind(s) -> dict:
-    """Handlers and threads of the add-on, and modal operators of the windows."""
+    """Handlers, timers and threads of the add-on, and modal operators of the windows."""
+    functions = {f for name, module in list(sys.modules.items()) if name.startswith(s.ID)
+                 for f in vars(module).values() if inspect.isfunction(f)}
     handlers = {name: sum(getattr(h, "__module__", "").startswith(s.ID) for h in getattr(bpy.app.handlers, name))
                 for name in dir(bpy.app.handlers) if isinstance(getattr(bpy.app.handlers, name), list)}
     return {"handlers": {name: count for name, count in handlers.items() if count},
+            "timers": sum(map(bpy.app.timers.is_registered, functions)),
             "threads": sum(t.name.startswith("neural_gash") for t in threading.enumerate()),
             # None: of a class that is gone; Blender drops it with the next event
             "modal": sum(op is not None for w in bpy.context.window_manager.windows for op in w.modal_operators)}
@@ -100,7 +105,8 @@ def disabled(s, begin):
         now = left_behind(s)
         if not (now["threads"] or now["modal"]):
             break
-    s.expect(now == {"handlers": {}, "threads": 0, "modal": 0} and not state.running, "disabling_leaves_nothing")
+    nothing = {"handlers": {}, "timers": 0, "threads": 0, "modal": 0}
+    s.expect(now == nothing and not state.running, "disabling_leaves_nothing")
     bpy.context.object.location.x += 1  # what was followed moves
     bpy.context.scene.frame_set(2)
     yield 1.0
