@@ -22,6 +22,7 @@ from .workers import product, results
 
 SETS = 16
 MAX_RAYS = 4096
+RATE = 1.5              # the variance falls as rays**-RATE (scrambled nets, measured)
 RAYS_PER_JOB = 1 << 16  # about 15 ms of one thread: short enough to stop at once, long enough to be efficient
 # Directions up to which a job mixes points of all sets, if there are more rays than one job has: with more, one matrix
 # product for all points of a set is quicker, with fewer, not having to go from set to set is.
