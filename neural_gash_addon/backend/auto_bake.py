@@ -5,16 +5,26 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from .geometry import TriangleMesh
-from .plan import Plan, choose, nothing_blocks, pilot
+from .pilot import Pilot, look
+from .plan import Plan, choose, nothing_blocks
 from .progress import scaled
 from .raycast import Geometry, Occluders
 from .transfer import Transfer
 from .workers import default_threads
 
 _PILOT_SHARE = 0.05  # of the progress
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """What is to be run, and what is there for it already."""
+
+    plan: Plan
+    scene: Occluders | None
+    pilot: Pilot | None  # None: nothing was traced
 
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None, occluders: Sequence[Geometry],
@@ -26,25 +36,34 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     bakers: the methods that a plan may name. With a number of rays there is nothing to plan but whether any is needed.
     """
     began = time.perf_counter()
-    probes = 0
-    unseen = 0.0  # relative error of an unshadowed bake
-    if nothing_blocks(mesh, occluders):
-        plan = Plan("analytic", reason="Nothing rises above any point's horizon: unshadowed is exact.")
-    elif tolerance is None:
-        plan = Plan("embree", rays=rays, reason="A number of rays was asked for: they are traced from every point.")
-    else:
-        threads = threads or default_threads()
-        if scene is None:
-            scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
-        with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
-            found = yield from scaled(pilot(mesh, scene, order, seed, pool, threads), 0, _PILOT_SHARE)
-        probes = found.rays
-        plan = choose(found, len(mesh.points), tolerance)
-        unseen = found.blocked
+    found = yield from scaled(planned(mesh, order, rays, tolerance, occluders, seed, threads, scene), 0, _PILOT_SHARE)
+    plan, pilot = found.plan, found.pilot
+    known = {"pilot": pilot} if plan.method != "analytic" else {}
     work = bakers[plan.method](mesh, order, rays=plan.rays, tolerance=plan.tolerance, occluders=occluders, seed=seed,
-                               threads=threads, scene=scene)
+                               threads=threads, scene=found.scene, **known)
     transfer = yield from scaled(work, _PILOT_SHARE, 1 - _PILOT_SHARE)
-    error = unseen if plan.method == "analytic" else transfer.record.error_estimate
-    return Transfer(transfer.coefficients, replace(
-        transfer.record, probe_rays=transfer.record.probe_rays + probes, seconds=time.perf_counter() - began,
-        tolerance=tolerance, error_estimate=error, plan=plan.reason))
+    record = transfer.record
+    error, probes = record.error_estimate, record.probe_rays
+    if plan.method == "analytic":
+        error = pilot.blocked if pilot is not None else 0.0
+    if pilot is not None:
+        probes += pilot.traced
+    return Transfer(transfer.coefficients, replace(record, probe_rays=probes, seconds=time.perf_counter() - began,
+                                                   tolerance=tolerance, error_estimate=error, plan=plan.reason))
+
+
+def planned(mesh: TriangleMesh, order: int, rays: int | None, tolerance: float | None, occluders: Sequence[Geometry],
+            seed: int, threads: int | None, scene: Occluders | None) -> Generator[float, None, Planned]:
+    """Look, and choose; arguments as `methods.bake`. Yields progress."""
+    if nothing_blocks(mesh, occluders):
+        return Planned(Plan("analytic", reason="Nothing rises above any point's horizon: unshadowed is exact."), scene,
+                       None)
+    if tolerance is None:
+        return Planned(Plan("embree", rays=rays, reason="A number of rays was asked for: they are traced from every "
+                                                        "point."), scene, None)
+    threads = threads or default_threads()
+    if scene is None:
+        scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
+    with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+        pilot = yield from look(mesh, scene, order, tolerance, seed, pool, threads)
+    return Planned(choose(pilot, len(mesh.points), tolerance), scene, pilot)

@@ -31,6 +31,9 @@ PATCH_RAYS = 128
 MIN_RAYS, MAX_RAYS = 64, 256  # of a point's gathering
 MAX_BOUNCES = 64
 INVISIBLE = 2e-3      # of all transfer: a bounce that adds less is the last
+LEFT_OUT = 0.3        # of a tolerance: what bounces may be that are left out, as 0.95**2 + 0.3**2 is 1
+_FALL = 0.5, 0.95     # from one bounce to the next, at least (where but one is known) and at most
+BLACK = "Everything is black: no bounce is computed."
 _RAYS_AT_ONCE = 1 << 17
 _SETS = 16
 
@@ -53,10 +56,12 @@ class Reflection:
         """
         began = time.perf_counter()
         order = transfer.record.order
+        planned = transfer.record.tolerance if transfer.record.plan else None
         if self.solution is None:
             parts = [(mesh.positions, mesh.triangles), *occluders]
             self.solution = Bounces(parts, self.albedo, scene, order, self.seed, threads, pictures=self.pictures)
-            yield from self.solution.solve(self.bounces)
+            yield from self.solution.solve(self.bounces, allowed=None if planned is None else LEFT_OUT * planned)
+        transfer = Transfer(transfer.coefficients, transfer.record.also(self._why()))
         if not self.solution.used:
             return transfer
         rays = int(np.clip(transfer.record.rays_per_point, MIN_RAYS, MAX_RAYS))
@@ -65,6 +70,23 @@ class Reflection:
                          rays=transfer.record.rays + rays * len(mesh.points),
                          seconds=transfer.record.seconds + time.perf_counter() - began)
         return Transfer(transfer.coefficients[:, :, None] + bounced, record)
+
+
+    @property
+    def black(self) -> bool:
+        """Whether everything is, so that nothing needs to be known of the scene."""
+        return not self.albedo.any() and not self.pictures
+
+    def _why(self) -> str:
+        """One sentence: how many bounces there are."""
+        assert self.solution is not None
+        used, left = self.solution.used, f"{100 * self.solution.left_out:.1g} %"
+        if self.solution.left_out and not used:
+            return f"Light that bounces would add {left}, too little for the tolerance: no bounce is computed."
+        if self.solution.left_out:
+            return f"Of {self.bounces} bounces asked for, {used} {'is' if used == 1 else 'are'} enough: the others " \
+                   f"would add {left}."
+        return f"Bounces computed: {used} of the {self.bounces} asked for." if used else BLACK
 
 
 class Bounces:
@@ -81,6 +103,7 @@ class Bounces:
         self.patches = Patches(parts, budget)
         self.albedo = np.clip(self.patches.mean(albedo, pictures), 0, 1)  # (M, 3)
         self.added: list[float] = []  # transfer of constant light that each bounce added, of all of it
+        self.left_out = 0.0           # relative L2 of the bounces that were not needed, about
         self._scene, self._order, self._seed = scene, order, seed
         self._threads = threads or default_threads()
         self.sides = np.zeros(0, np.int64)               # traced sides: 2 * patch, plus 1 for its back
@@ -95,9 +118,12 @@ class Bounces:
         """How many bounces were computed."""
         return len(self.added)
 
-    def solve(self, bounces: int = MAX_BOUNCES, tolerance: float = INVISIBLE) -> Generator[float, None, None]:
+    def solve(self, bounces: int = MAX_BOUNCES, tolerance: float = INVISIBLE, allowed: float | None = None
+              ) -> Generator[float, None, None]:
         """Trace the patches once, and bounce until `bounces` are done, or one adds less than `tolerance`.
 
+        allowed: relative L2 of all transfer. Where a bounce and all that follow it (a geometric series) come to no
+            more, they are left out.
         Yields:
             Progress, 0 to 1.
         """
@@ -106,13 +132,21 @@ class Bounces:
         yield from self.trace()
         reflectance = self.albedo[self.sides // 2]                        # (sides, 3)
         now = np.repeat(self.direct[:, :, None], 3, axis=2)              # (sides, K, 3)
-        total = np.zeros_like(now)
+        total, everything = np.zeros_like(now), now.copy()
         areas = self._areas()
         whole = float(areas @ now[:, 0].mean(1))
         for number in range(bounces):
             leaving = (now * reflectance[:, None]).reshape(len(now), -1).astype(np.float32)
-            total += leaving.reshape(total.shape)
+            size = _size(now, areas)
             now = self.gathered(leaving).reshape(now.shape)
+            everything += now
+            if allowed is not None:
+                falls = _size(now, areas) / size if size > 0 else 0.0
+                rest = _size(now, areas) / (1 - min(max(falls, 0.0 if number else _FALL[0]), _FALL[1]))
+                if rest <= allowed * _size(everything, areas):
+                    self.left_out = rest / _size(everything, areas) if rest > 0 else 0.0
+                    break
+            total += leaving.reshape(total.shape)
             added = float(areas @ now[:, 0].mean(1))
             whole += added
             self.added.append(added / whole if whole > 0 else 0.0)
@@ -220,6 +254,11 @@ class Bounces:
     def _areas(self) -> NDArray[np.float64]:
         """(sides,) area of each traced side."""
         return self.patches.patch_areas[self.sides // 2]
+
+
+def _size(values: NDArray, areas: NDArray) -> float:
+    """L2 norm over the surface of values (sides, K, 3)."""
+    return float(areas @ np.square(values).sum((1, 2))) ** 0.5
 
 
 def spread(work: Callable, jobs: list, threads: int) -> Generator[float, None, None]:

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import spherical_harmonics as sh
-from .estimator import MAX_RAYS, BlockedEstimator, morton_order
+from .estimator import MAX_RAYS, RATE, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
+from .pilot import Pilot
 from .progress import scaled
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
@@ -20,17 +21,17 @@ from .workers import default_threads
 
 BLOCK = 1 << 16         # points accumulated at a time, so that memory does not grow with the mesh
 FIRST_RAYS = 32         # of an adaptive point; it has twice that before it may stop
-RATE = 1.5              # the estimator's variance falls as rays**-RATE (scrambled nets, measured)
 KEPT = 0.7              # squared error left after a doubling, as a part of the squared change (calibrated)
 POOL = 9                # neighbours along the Z-order curve whose error estimates are averaged
-REPLICATES = 1024       # points baked twice to measure the error, or a 32nd of them if that is more
-_MAX_REPLICATES = 8192
+SCALE_POINTS = 1024     # that say what a tolerance is relative to
+REPLICATES = 1024       # points baked twice to measure the error; a 16th of them, if that is less, or a 32nd, if more
+_FEWEST, _MOST = 256, 8192
 
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
          occluders: Sequence[Geometry], seed: int, threads: int | None, scene: Occluders | None = None,
-         ) -> Generator[float, None, Transfer]:
-    """Trace `mesh` against itself and `occluders`; arguments as `methods.bake`."""
+         pilot: Pilot | None = None) -> Generator[float, None, Transfer]:
+    """Trace `mesh` against itself and `occluders`; arguments as `methods.bake`. pilot: what is known beforehand."""
     began = time.perf_counter()
     threads = threads or default_threads()
     if scene is None:
@@ -45,8 +46,8 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     probes = 0
     error: float | None = 0.0
     with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
-        scale = None
-        if tolerance is not None and len(lit):
+        scale = pilot.scale if pilot is not None and tolerance is not None else None
+        if scale is None and tolerance is not None and len(lit):
             scale, probes = yield from _pilot(estimator, lit, order, pool, threads)
         for start in range(0, len(lit), BLOCK):
             block = lit[start:start + BLOCK]
@@ -67,7 +68,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
 def _pilot(estimator: BlockedEstimator, lit: NDArray, order: int, pool: ThreadPoolExecutor, threads: int
            ) -> Generator[float, None, tuple[float, int]]:
     """RMS of |T| over the mesh from a sample of points: what a relative tolerance is relative to."""
-    sample = lit[::max(1, len(lit) // REPLICATES)]
+    sample = lit[::max(1, len(lit) // SCALE_POINTS)]
     sums = np.zeros((len(sample), sh.coefficient_count(order)))
     for _ in estimator.trace(pool, threads, sample, 0, FIRST_RAYS, sums):
         yield 0.0
@@ -148,7 +149,7 @@ def _measured_error(mesh: TriangleMesh, scene: Occluders, order: int, seed: int,
     Two independent estimates with the same rays differ by sqrt(2) standard errors; nothing is
     assumed of how fast the error falls.
     """
-    size = min(len(lit), max(REPLICATES, min(len(lit) // 32, _MAX_REPLICATES)))
+    size = min(len(lit), max(_FEWEST, min(REPLICATES, len(lit) // 16), min(_MOST, len(lit) // 32)))
     rng = np.random.default_rng([seed, 1])
     sample = lit[np.sort(rng.choice(len(lit), size, replace=False))]
     taken = rays_of_point[sample]

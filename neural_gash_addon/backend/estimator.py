@@ -22,6 +22,7 @@ from .workers import product, results
 
 SETS = 16
 MAX_RAYS = 4096
+RATE = 1.5              # the variance falls as rays**-RATE (scrambled nets, measured)
 RAYS_PER_JOB = 1 << 16  # about 15 ms of one thread: short enough to stop at once, long enough to be efficient
 # Directions up to which a job mixes points of all sets, if there are more rays than one job has: with more, one matrix
 # product for all points of a set is quicker, with fewer, not having to go from set to set is.
@@ -43,7 +44,8 @@ class BlockedEstimator:
         rng = np.random.default_rng([seed, 0])
         self._occluders = occluders
         self._order = order
-        self._sets = sampling.hemisphere_sets(sets, rays, int(rng.integers(2**31)))
+        self._count, self._most, self._scramble = sets, rays, int(rng.integers(2**31))
+        self._made = np.zeros((sets, 0, 3))  # directions so far: most bakes stop long before the most rays
         self._origins = occluders.origins(mesh.points, mesh.clearance)
         self._normals = mesh.normals
         self._angles = rng.uniform(0, 2 * np.pi, len(mesh.points)).astype(np.float32)
@@ -87,17 +89,17 @@ class BlockedEstimator:
         harmonics = self._harmonics(start, stop)
         if stop - start <= _MIXED or len(points) * (stop - start) <= RAYS_PER_JOB:
             size = max(1, _MIXED_RAYS_PER_JOB // (stop - start))
-            every = self._sets[:, start:stop].astype(np.float32)
+            every = self._sets(stop)[:, start:stop].astype(np.float32)
             for part in np.array_split(np.arange(len(points)), -(-len(points) // size)):
                 yield part, (every, harmonics)
             return
         rows_by_set = np.argsort(set_of_row, kind="stable")
-        bounds = np.searchsorted(set_of_row[rows_by_set], np.arange(len(self._sets) + 1))
-        for s in range(len(self._sets)):
+        bounds = np.searchsorted(set_of_row[rows_by_set], np.arange(self._count + 1))
+        for s in range(self._count):
             rows = rows_by_set[bounds[s]:bounds[s + 1]]
             if not len(rows):
                 continue
-            local = self._sets[s, start:stop]
+            local = self._sets(stop)[s, start:stop]
             # (9, 3r): frame (row-major, 9) @ lift = the r directions' world coordinates in a row,
             # so that one matrix product makes the rays of many points in the layout Embree reads
             lift = np.einsum("cd,ja->cajd", np.eye(3), local).reshape(9, -1).astype(np.float32)
@@ -106,8 +108,15 @@ class BlockedEstimator:
 
     def _harmonics(self, start: int, stop: int) -> NDArray[np.float64]:
         """(sets, stop - start, K) of the directions of each set."""
-        local = self._sets[:, start:stop]
+        local = self._sets(stop)[:, start:stop]
         return sh.evaluate(local.reshape(-1, 3), self._order).reshape(*local.shape[:2], -1)
+
+    def _sets(self, stop: int) -> NDArray[np.float64]:
+        """(sets, at least stop, 3) directions. A longer net begins with the shorter ones."""
+        if self._made.shape[1] < stop:
+            count = min(1 << (stop - 1).bit_length(), self._most)
+            self._made = sampling.hemisphere_sets(self._count, count, self._scramble)
+        return self._made
 
     def _blocked_sums(self, points: NDArray, directions: NDArray, harmonics: NDArray) -> NDArray[np.float64]:
         """Worker: (n, K) sums of Y_k over the blocked ones of some directions at some points.

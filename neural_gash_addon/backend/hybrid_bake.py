@@ -14,6 +14,7 @@ from . import spherical_harmonics as sh
 from .estimator import MAX_RAYS, BlockedEstimator
 from .geometry import TriangleMesh
 from .hybrid import Network, curves, filtered, placed
+from .pilot import Pilot, pilot_rays, sample_size
 from .progress import run, scaled
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
@@ -21,21 +22,26 @@ from .transfer import Transfer
 from .weights import load_hybrid
 from .workers import default_threads
 
-FIRST_RAYS = 4        # of a bake to a tolerance; doubled until it is met
+FIRST_RAYS = 4        # of a bake to a tolerance, where nothing is known beforehand
+_LADDER = sorted([2 ** k for k in range(2, 13)] + [3 * 2 ** k for k in range(1, 11)])  # rays of one to a tolerance
+_TAKEN, _TAKES = 0.36, 0.225  # the error with 4 rays beside a plain bake's, and the power of rays by which it nears it
+_FALLS = 0.55         # the error falls as rays**-_FALLS, for saying how many rays more are wanted
+_STEP = 1.4, 4.0      # from a number of rays to the next, at least and at most
 _ROWS = 1 << 14       # whose unshadowed transfer one worker computes at a time
 _SAMPLE = 128         # points at which the error is measured, or a 256th of them if that is more
 _MOST_SAMPLE = 2048
 _SAMPLE_SETS = 4
-# Rays of each of two independent traces there, by those of the bake: a larger error needs fewer to be measured.
+# Rays of each of two independent traces there, where the bake's are given: a larger error needs fewer to be measured.
 _SAMPLE_TIMES, _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS = 4, 32, 128
 
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
          occluders: Sequence[Geometry], seed: int, threads: int | None, scene: Occluders | None = None,
-         ) -> Generator[float, None, Transfer]:
+         pilot: Pilot | None = None) -> Generator[float, None, Transfer]:
     """Trace `mesh` against itself and `occluders`, and take from neighbours; arguments as `methods.bake`.
 
-    With a tolerance the rays double until the measured error is within it, or they are MAX_RAYS.
+    With a tolerance there are more rays until the measured error is within it, or they are MAX_RAYS. pilot: what is
+    known beforehand; its points are those at which the error is measured.
     """
     began = time.perf_counter()
     network = load_hybrid()
@@ -48,23 +54,39 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
         list(pool.map(lambda rows: np.copyto(unshadowed[rows], sh.cosine_lobe(mesh.normals[rows], order)),
                       [slice(start, start + _ROWS) for start in range(0, len(unshadowed), _ROWS)]))
-        work = _Work(mesh, scene, order, seed, last, lit, pool, threads, network, unshadowed)
+        work = _Work(mesh, scene, order, seed, last, lit, pool, threads, network, unshadowed, tolerance)
         error, used, left = None, 0, 1.0
+        stop = last if tolerance is None else FIRST_RAYS if pilot is None else expected_rays(pilot, tolerance)
         blocked = np.zeros_like(unshadowed)
-        sample = pool.submit(work.sample) if len(lit) else None  # beside the rest, which waits for rays
+        sample = None
+        if len(lit):  # beside the rest, which waits for rays
+            sample = pool.submit(work.sample if pilot is None else lambda: pilot.sample)
         while sample is not None:
-            stop = last if rays is not None else min(max(2 * used, FIRST_RAYS), last)
-            share = left if rays is not None else left / 2
+            share = left if tolerance is None else left / 2
             traced, taken = yield from scaled(work.trace(used, stop), 1 - left, share)
             used, left = stop, left - share
             blocked = work.blended(traced, taken, *sample.result())
             error = work.error(blocked, *sample.result())
             if used == last or (error is not None and tolerance is not None and error <= tolerance):
                 break
+            stop = _more(used, error, tolerance)
     return Transfer(unshadowed - blocked, BakeRecord(
         method="hybrid", order=order, points=len(mesh.points), domain=mesh.domain, seed=seed, rays=used * len(lit),
-        probe_rays=work.probes, seconds=time.perf_counter() - began, error_estimate=error if len(lit) else 0.0,
-        tolerance=tolerance))
+        probe_rays=work.probes if pilot is None else 0, seconds=time.perf_counter() - began,
+        error_estimate=error if len(lit) else 0.0, tolerance=tolerance))
+
+
+def expected_rays(pilot: Pilot, tolerance: float) -> int:
+    """Rays with which a bake is expected to meet a tolerance."""
+    return next((rays for rays in _LADDER
+                 if min(_TAKEN * (rays / 4) ** _TAKES, 1.0) * pilot.noise_of(rays) <= tolerance), MAX_RAYS)
+
+
+def _more(rays: int, error: float | None, tolerance: float | None) -> int:
+    """Rays with which a bake meets the tolerance, if with so many it has this error."""
+    times = 2.0 if error is None or tolerance is None else (error / tolerance) ** (1 / _FALLS)
+    wanted = rays * min(max(times, _STEP[0]), _STEP[1])
+    return next((r for r in _LADDER if r >= wanted), MAX_RAYS)
 
 
 def at_once(mesh: TriangleMesh, occluders: Sequence[Geometry], order: int, rays: int, seed: int) -> NDArray[np.float32]:
@@ -87,7 +109,7 @@ class _Work:
 
     def __init__(self, mesh: TriangleMesh, scene: Occluders, order: int, seed: int, rays: int, lit: NDArray,
                  pool: ThreadPoolExecutor, threads: int, network: Network, unshadowed: NDArray[np.float32],
-                 ) -> None:
+                 tolerance: float | None = None) -> None:
         self._estimator = BlockedEstimator(mesh, scene, order, seed, rays)
         self._mesh, self._scene, self._order, self._seed = mesh, scene, order, seed
         self._unshadowed = unshadowed
@@ -102,6 +124,8 @@ class _Work:
         self._sums = np.zeros((len(lit), sh.coefficient_count(order)))
         self._sample_size = min(len(lit), max(_SAMPLE, min(len(lit) // 256, _MOST_SAMPLE)))
         self._sample_rays = int(np.clip(_SAMPLE_TIMES * rays, _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS))
+        if tolerance is not None:
+            self._sample_size, self._sample_rays = sample_size(len(lit)), pilot_rays(tolerance)
         self.probes = 2 * self._sample_size * self._sample_rays
 
     def trace(self, start: int, stop: int) -> Generator[float, None, tuple[NDArray[np.float32], NDArray[np.float32]]]:

@@ -5,16 +5,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from . import auto_bake, embree_bake, gnn_bake, hybrid_bake, paper_bake, sparse_bake
 from . import spherical_harmonics as sh
-from .bounce import Reflection
+from .bounce import BLACK, Reflection
 from .errors import UserError
 from .estimator import MAX_RAYS
-from .geometry import TriangleMesh
+from .geometry import TEXEL, TriangleMesh
+from .plan import nothing_blocks
 from .progress import run as run  # the callers of `bake` drive it
 from .progress import scaled
 from .raycast import Geometry, Occluders
@@ -24,6 +26,7 @@ from .transfer import Transfer
 Baking = Generator[float, None, Transfer]
 MIN_ORDER = 2
 MIN_TOLERANCE = 1e-4
+_FREE = "No point sees another surface: no bounce is computed."
 
 
 @dataclass(frozen=True)
@@ -118,18 +121,20 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
             raise UserError(f"The number of rays must be 1 to {16 * MAX_RAYS}, not {rays}.")
         if tolerance is not None and not MIN_TOLERANCE * (1 - 1e-6) <= tolerance <= 1:  # Blender keeps float32
             raise UserError(f"The tolerance must be {MIN_TOLERANCE:g} to 1, not {tolerance:g}.")
+    direct = partial(entry.bake, mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed,
+                     threads=threads)
     if reflection is None or not entry.traces:
-        return entry.bake(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed,
-                          threads=threads, scene=scene)
-    if scene is None:
-        scene = _embree_scene(mesh, occluders)
-    direct = entry.bake(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed, threads=threads,
-                        scene=scene)
+        return direct(scene=scene)
     return _with_bounces(direct, mesh, occluders, scene, threads, reflection)
 
 
-def _with_bounces(direct: Baking, mesh: TriangleMesh, occluders: Sequence[Geometry], scene: Occluders,
-                  threads: int | None, reflection: Reflection) -> Baking:
-    """A bake of direct transfer, and then what bounces add to it."""
-    transfer = yield from scaled(direct, 0, 0.6)
+def _with_bounces(direct: Callable[..., Baking], mesh: TriangleMesh, occluders: Sequence[Geometry],
+                  scene: Occluders | None, threads: int | None, reflection: Reflection) -> Baking:
+    """A bake of direct transfer, and then what bounces add to it; where nothing can bounce, nothing is looked at."""
+    if reflection.black or (mesh.domain != TEXEL and nothing_blocks(mesh, occluders)):  # tiles must be alike
+        found = yield from direct(scene=scene)
+        return Transfer(found.coefficients, found.record.also(BLACK if reflection.black else _FREE))
+    if scene is None:
+        scene = _embree_scene(mesh, occluders)
+    transfer = yield from scaled(direct(scene=scene), 0, 0.6)
     return (yield from scaled(reflection.add(transfer, mesh, occluders, scene, threads), 0.6, 0.4))

@@ -52,7 +52,7 @@ class Occluders:
         parts = [(p, t) for p, t in parts if len(p) and len(t)]
         # The box is that of what is baked, however large the world around it: rays must not start
         # farther off a coin on a floor because the floor is wide. Loose vertices do not stretch it.
-        corners = parts[0][0][_used(*parts[0])]
+        corners = parts[0][0][used(*parts[0])]
         low, high = corners.min(0), corners.max(0)
         self.centre = 0.5 * (low + high)
         extent = float(np.max(high - low))
@@ -66,7 +66,7 @@ class Occluders:
             for start in range(0, len(triangles), PIECE):
                 first.append(before + start)
                 piece = triangles[start:start + PIECE]
-                here = _used(positions, piece)
+                here = used(positions, piece)
                 number[here] = np.arange(len(here), dtype=np.int32)
                 EmbreeMesh(self._scene, self.normalise(positions[here]), number[piece])
             before += len(triangles)
@@ -108,7 +108,7 @@ class Occluders:
         return faces, found["u"], found["v"], found["Ng"]
 
 
-def _used(positions: NDArray, triangles: NDArray) -> NDArray[np.int64]:
+def used(positions: NDArray, triangles: NDArray) -> NDArray[np.int64]:
     """Vertices that triangles (F, 3) have, rising. By a mask: sorting takes as long as Embree does for the rest."""
     mask = np.zeros(len(positions), dtype=bool)
     mask[triangles] = True

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 
 import numpy as np
 
@@ -45,7 +45,7 @@ class BakeRecord:
     single_faces: int = 0             # that lie alone in it, as xatlas could not chart them with their neighbours
     bounces: int = 0                  # of diffuse interreflection that were computed
     colours: int = 1                  # transfer is (N, K), or (N, K, 3) where light bounced off colours
-    plan: str = ""                    # why this method, where it was planned
+    plan: str = ""                    # why so, where it was planned: one sentence for each choice
     basis: str = BASIS
     version: str = VERSION
     schema: int = SCHEMA
@@ -59,6 +59,10 @@ class BakeRecord:
     def rays_per_point(self) -> float:
         """Mean number of rays a point took."""
         return self.rays / max(self.points, 1)
+
+    def also(self, sentence: str) -> BakeRecord:
+        """The same, with one sentence more of why, if it was planned."""
+        return replace(self, plan=f"{self.plan} {sentence}") if self.plan else self
 
     def to_json(self) -> str:
         """One line of JSON."""

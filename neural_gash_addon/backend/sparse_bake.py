@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from . import embree_bake
 from . import spherical_harmonics as sh
-from .embree_bake import RATE
-from .estimator import MAX_RAYS, BlockedEstimator, morton_order
+from .estimator import MAX_RAYS, RATE, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
 from .hybrid import FULL
+from .pilot import Pilot
 from .progress import scaled
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
@@ -48,8 +48,8 @@ _ROWS = 1 << 13        # reconstructed by one worker at a time
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
          occluders: Sequence[Geometry], seed: int, threads: int | None, scene: Occluders | None = None,
-         ) -> Generator[float, None, Transfer]:
-    """Trace some points of `mesh`, and reconstruct the rest; arguments as `methods.bake`.
+         pilot: Pilot | None = None) -> Generator[float, None, Transfer]:
+    """Trace some points of `mesh`, and reconstruct the rest; arguments as `methods.bake`. pilot: known beforehand.
 
     With a number of rays, the samples take so many each, and are as many as it takes for the whole to be as exact as
     if every point had been traced with them.
@@ -75,7 +75,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
                     tolerance=tolerance))
         spent = traced + work.probes
     every = yield from embree_bake.bake(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed,
-                                        threads=threads, scene=scene)
+                                        threads=threads, scene=scene, pilot=pilot)
     return replace(every, record=replace(every.record, method="sparse", probe_rays=every.record.probe_rays + spent,
                                          seconds=time.perf_counter() - began))
 

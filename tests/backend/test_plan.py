@@ -7,6 +7,7 @@ from neural_gash_addon.backend import methods, metrics, plan
 from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.errors import UserError
 from neural_gash_addon.backend.geometry import TriangleMesh
+from neural_gash_addon.backend.pilot import Pilot
 from neural_gash_addon.backend.record import BakeRecord
 
 from .shapes import cube, grid, sphere, torus
@@ -14,6 +15,11 @@ from .shapes import cube, grid, sphere, torus
 
 def bake(mesh, **arguments):
     return methods.run(methods.bake(mesh, **arguments))
+
+
+def seen(blocked, noise):
+    """What a pilot may have seen, with 64 rays."""
+    return Pilot(blocked, 1.2 * blocked, noise, rays=64, scale=1.0, ray=1e-7, traced=1, sample=())
 
 
 def slowly(mesh, occluders=()):
@@ -65,18 +71,18 @@ def test_the_tolerance_is_kept_and_the_plan_recorded(tolerance):
 
 
 def test_looser_tolerances_never_cost_more_and_the_cheapest_is_taken():
-    found = plan.Pilot(blocked=0.3, noise=0.03, ray=1e-7, rays=1)
+    found = seen(0.3, 0.03)
     for points in (500, 20_000, 1_000_000):
         before = 0.0
         for tolerance in (0.2, 0.1, 0.05, 0.02, 0.01):
-            every = [plan._seconds(p, found, points) for p in plan.plans(found, points, tolerance)]
-            chosen = plan._seconds(plan.choose(found, points, tolerance), found, points)
+            every = [plan.seconds(p, found, points) for p in plan.plans(found, points, tolerance)]
+            chosen = plan.seconds(plan.choose(found, points, tolerance), found, points)
             assert chosen == min(every) and chosen >= before
             before = chosen
 
 
 def test_shadows_below_the_tolerance_are_not_traced():
-    found = plan.Pilot(blocked=0.01, noise=0.001, ray=1e-7, rays=1)
+    found = seen(0.01, 0.001)
     assert plan.choose(found, 1000, 0.02).method == "analytic"
     assert plan.choose(found, 1000, 0.005).method != "analytic"
 
