@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +52,7 @@ class BlockedEstimator:
         self._angles = rng.uniform(0, 2 * np.pi, len(mesh.points)).astype(np.float32)
         self._set_of_point = rng.integers(0, sets, len(mesh.points), dtype=np.uint8)
         self._excess: dict[tuple[int, int], NDArray] = {}
+        self._evaluated: tuple[tuple[int, int], NDArray] | None = None  # the last of `_harmonics`
 
     def trace(self, pool: ThreadPoolExecutor, threads: int, points: NDArray, start: int, stop: int,
               sums: NDArray[np.float64]) -> Generator[float, None, None]:
@@ -108,8 +110,12 @@ class BlockedEstimator:
 
     def _harmonics(self, start: int, stop: int) -> NDArray[np.float64]:
         """(sets, stop - start, K) of the directions of each set."""
-        local = self._sets(stop)[:, start:stop]
-        return sh.evaluate(local.reshape(-1, 3), self._order).reshape(*local.shape[:2], -1)
+        known = self._evaluated
+        if known is None or known[0] != (start, stop):
+            local = self._sets(stop)[:, start:stop]
+            known = (start, stop), sh.evaluate(local.reshape(-1, 3), self._order).reshape(*local.shape[:2], -1)
+            self._evaluated = known
+        return known[1]
 
     def _sets(self, stop: int) -> NDArray[np.float64]:
         """(sets, at least stop, 3) directions. A longer net begins with the shorter ones."""
@@ -144,8 +150,7 @@ class BlockedEstimator:
         transfer, one that is all free exactly nothing.
         """
         if (start, stop) not in self._excess:
-            exact = sh.cosine_lobe(np.array([[0.0, 0.0, 1.0]]), self._order)[0]
-            self._excess[start, stop] = exact - self._harmonics(start, stop).mean(1)
+            self._excess[start, stop] = _upright_lobe(self._order) - self._harmonics(start, stop).mean(1)
         mean = sums / (stop - start)
         share = mean[:, :1] / sh.normalisation(0, 0)  # Y_0 is constant, so this counts the blocked rays
         return mean + share * self._excess[start, stop][self._set_of_point[points]]
@@ -184,18 +189,22 @@ class BlockedEstimator:
         return sampling.frames(self._normals[points], self._angles[points].astype(np.float64))
 
 
+@lru_cache(maxsize=sh.MAX_ORDER)
+def _upright_lobe(order: int) -> NDArray[np.float64]:
+    """(K,) unshadowed transfer in every local frame."""
+    return sh.cosine_lobe(np.array([[0.0, 0.0, 1.0]]), order)[0]
+
+
 def morton_order(points: NDArray) -> NDArray[np.int64]:
     """Indices (N,) that walk the points (N, 3) along a Z-order curve: neighbours in it are near in space."""
-    low = points.min(0)
-    extent = float((points.max(0) - low).max()) or 1.0
+    rows = np.ascontiguousarray(points.T)  # NumPy is quick along long last axes
+    low = rows.min(1, keepdims=True)
+    extent = float((rows.max(1, keepdims=True) - low).max()) or 1.0
     # not at the corner of the cube that the curve fills: planes of symmetry would lie between its halves, and rounding
     # would decide on which side a point is
-    cells = ((0.0618 + 0.8 * (points - low) / extent) * 2**20).astype(np.uint64)
-    code = np.zeros(len(points), dtype=np.uint64)
-    for axis in range(3):
-        x = cells[:, axis]
-        for shift, mask in ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
-                            (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)):
-            x = (x | (x << np.uint64(shift))) & np.uint64(mask)
-        code |= x << np.uint64(axis)
-    return np.argsort(code, kind="stable")
+    cells = ((0.0618 + 0.8 * (rows - low) / extent) * 2**20).astype(np.uint64)
+    for shift, mask in ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
+                        (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)):
+        cells |= cells << np.uint64(shift)
+        cells &= np.uint64(mask)
+    return np.argsort(cells[0] | cells[1] << np.uint64(1) | cells[2] << np.uint64(2), kind="stable")

@@ -56,14 +56,15 @@ def placed(points: NDArray, normals: NDArray) -> tuple[NDArray[np.float64], NDAr
     however they are turned, moved and scaled; and however they are listed, unless several points are equally far: of
     those, the first counts.
     """
-    away = points - points.mean(0)
-    reach = np.sqrt(np.square(away).sum(1))
+    away = np.ascontiguousarray(points.T)
+    away = away - away.mean(1, keepdims=True)
+    reach = np.sqrt(np.square(away).sum(0))
     most = float(reach.max(initial=0.0)) or 1.0
-    one = unit(away[_first_of_the_greatest(reach)])
-    off = away - np.einsum("nx,x->n", away, one)[:, None] * one
-    two = unit(off[_first_of_the_greatest(np.square(off).sum(1))])
-    axes = np.stack([one, two, np.cross(one, two)], 1)
-    return _turned(away, axes / (2 * most)), _turned(normals, axes)
+    one = unit(away[:, _first_of_the_greatest(reach)])
+    off = away - one[:, None] * np.einsum("xn,x->n", away, one)
+    two = unit(off[:, _first_of_the_greatest(np.square(off).sum(0))])
+    axes = np.stack([one, two, np.cross(one, two)])
+    return _turned(axes / (2 * most), away), _turned(axes, np.ascontiguousarray(normals.T))
 
 
 def _first_of_the_greatest(values: NDArray) -> int:
@@ -73,12 +74,12 @@ def _first_of_the_greatest(values: NDArray) -> int:
 
 def curves(places: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """For each pass, indices (N,) that walk the points (N, 3), `placed`, along a curve."""
-    return morton_order(places), morton_order(_turned(places, _TURN))
+    return morton_order(places), morton_order(_turned(_TURN.T, places.T))
 
 
-def _turned(vectors: NDArray, axes: NDArray) -> NDArray[np.float64]:
-    """vectors (N, 3) @ axes (3, 3), not by BLAS: its threads would spin for a while on cores that trace rays."""
-    return np.einsum("nx,xy->ny", vectors, axes)
+def _turned(axes: NDArray, rows: NDArray) -> NDArray[np.float64]:
+    """(axes (3, 3) @ rows (3, N)).T, not by BLAS: its threads would spin for a while on cores that trace rays."""
+    return np.einsum("xy,yn->xn", axes, rows).T
 
 
 def filtered(places: NDArray, normals: NDArray, orders: Sequence[NDArray], blocked: NDArray[np.float32],

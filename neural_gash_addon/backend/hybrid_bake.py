@@ -30,9 +30,8 @@ _STEP = 1.4, 4.0      # from a number of rays to the next, at least and at most
 _ROWS = 1 << 14       # whose unshadowed transfer one worker computes at a time
 _SAMPLE = 128         # points at which the error is measured, or a 256th of them if that is more
 _MOST_SAMPLE = 2048
-_SAMPLE_SETS = 4
 # Rays of each of two independent traces there, where the bake's are given: a larger error needs fewer to be measured.
-_SAMPLE_TIMES, _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS = 4, 32, 128
+_SAMPLE_TIMES, _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS = 2, 8, 128
 
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
@@ -147,14 +146,14 @@ class _Work:
         """Some points (n,), and two independent traces (n, K) of their blocked part; on the calling thread."""
         rng = np.random.default_rng([self._seed, 1])
         points = self._lit[np.sort(rng.choice(len(self._lit), self._sample_size, replace=False))]
-        few = replace(self._mesh, points=self._mesh.points[points], normals=self._mesh.normals[points],
-                      clearance=self._mesh.clearance[points])
-        rows = np.arange(len(points))
-        one, two = (BlockedEstimator(few, self._scene, self._order, int(rng.integers(2**31)), self._sample_rays,
-                                     _SAMPLE_SETS) for _ in range(2))
-        found = [twin.turned_here(rows, twin.means(rows, twin.summed(rows, 0, self._sample_rays), 0, self._sample_rays))
-                 for twin in (one, two)]
-        return points, found[0], found[1]
+        twice = np.tile(points, 2)  # each point sees a net of its own
+        few = replace(self._mesh, points=self._mesh.points[twice], normals=self._mesh.normals[twice],
+                      clearance=self._mesh.clearance[twice])
+        rows = np.arange(len(twice))
+        twins = BlockedEstimator(few, self._scene, self._order, int(rng.integers(2**31)), self._sample_rays)
+        sums = twins.summed(rows, 0, self._sample_rays)
+        one, two = np.split(twins.turned_here(rows, twins.means(rows, sums, 0, self._sample_rays)), 2)
+        return points, one, two
 
     def blended(self, traced: NDArray, taken: NDArray, points: NDArray, one: NDArray, two: NDArray
                 ) -> NDArray[np.float32]:
