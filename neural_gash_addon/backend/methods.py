@@ -15,6 +15,7 @@ from .bounce import Reflection
 from .errors import UserError
 from .estimator import MAX_RAYS
 from .geometry import TriangleMesh
+from .lamps import Lamps
 from .progress import run as run  # the callers of `bake` drive it
 from .progress import scaled
 from .raycast import Geometry, Occluders
@@ -86,7 +87,8 @@ METHODS: dict[str, Method] = {m.name: m for m in (
 
 def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: int | None = None,
          tolerance: float | None = None, occluders: Sequence[Geometry] = (), seed: int = 0,
-         threads: int | None = None, scene: Any = None, reflection: Reflection | None = None) -> Baking:
+         threads: int | None = None, scene: Any = None, reflection: Reflection | None = None,
+         lamps: Lamps | None = None) -> Baking:
     """Bake the transfer of a mesh's points.
 
     Args:
@@ -98,6 +100,7 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
         occluders: what else blocks, parts (positions (V, 3), triangles (F, 3)) in the same frame.
         scene: mesh and occluders as the method `sees` them, where they are there already from another bake.
         reflection: light that bounces, if any shall; for methods that trace.
+        lamps: what lights the points besides, if anything shall.
         seed: independent seeds give independent errors. threads: one a core where not given.
     Yields:
         Progress, 0 to 1, many times a second. `close()` stops the workers.
@@ -118,14 +121,14 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
             raise UserError(f"The number of rays must be 1 to {16 * MAX_RAYS}, not {rays}.")
         if tolerance is not None and not MIN_TOLERANCE * (1 - 1e-6) <= tolerance <= 1:  # Blender keeps float32
             raise UserError(f"The tolerance must be {MIN_TOLERANCE:g} to 1, not {tolerance:g}.")
-    if reflection is None or not entry.traces:
-        return entry.bake(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed,
-                          threads=threads, scene=scene)
-    if scene is None:
+    bounces = reflection is not None and entry.traces
+    if bounces and scene is None:
         scene = _embree_scene(mesh, occluders)
-    direct = entry.bake(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed, threads=threads,
+    baking = entry.bake(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed, threads=threads,
                         scene=scene)
-    return _with_bounces(direct, mesh, occluders, scene, threads, reflection)
+    if bounces and reflection is not None:
+        baking = _with_bounces(baking, mesh, occluders, scene, threads, reflection)
+    return baking if lamps is None else _with_lamps(baking, mesh, lamps, seed, threads)
 
 
 def _with_bounces(direct: Baking, mesh: TriangleMesh, occluders: Sequence[Geometry], scene: Occluders,
@@ -133,3 +136,9 @@ def _with_bounces(direct: Baking, mesh: TriangleMesh, occluders: Sequence[Geomet
     """A bake of direct transfer, and then what bounces add to it."""
     transfer = yield from scaled(direct, 0, 0.6)
     return (yield from scaled(reflection.add(transfer, mesh, occluders, scene, threads), 0.6, 0.4))
+
+
+def _with_lamps(baking: Baking, mesh: TriangleMesh, lamps: Lamps, seed: int, threads: int | None) -> Baking:
+    """A bake of transfer, and then the irradiance from lamps."""
+    transfer = yield from scaled(baking, 0, 0.5)
+    return (yield from scaled(lamps.add(transfer, mesh, seed, threads), 0.5, 0.5))
