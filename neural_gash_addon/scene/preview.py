@@ -244,13 +244,19 @@ def shown_material(material: bpy.types.Material | None) -> bpy.types.Material | 
 
 def shader_node(material: bpy.types.Material | None) -> bpy.types.Node | None:
     """The first Principled or Diffuse shader that reaches the output of a material."""
+    surface = surface_socket(material)
+    if surface is None:
+        return None
+    return next((node for node in _upstream(surface) if node.type in COLOUR_SOCKETS), None)
+
+
+def surface_socket(material: bpy.types.Material | None) -> bpy.types.NodeSocket | None:
+    """The input of a material's output that says how its surface looks; None where no nodes do."""
     if material is None or not _has_nodes(material) or material.node_tree is None:
         return None
-    tree = material.node_tree
-    output = next((o for o in map(tree.get_output_node, ("ALL", "EEVEE", "CYCLES")) if o is not None), None)
-    if output is None:
-        return None
-    return next((node for node in _upstream(output.inputs["Surface"]) if node.type in COLOUR_SOCKETS), None)
+    output = next((o for o in map(material.node_tree.get_output_node, ("ALL", "EEVEE", "CYCLES")) if o is not None),
+                  None)
+    return None if output is None else output.inputs["Surface"]
 
 
 def _colour_socket(material: bpy.types.Material) -> bpy.types.NodeSocket | None:
