@@ -14,7 +14,8 @@ from ..backend.errors import UserError
 from ..backend.pictures import Picture
 from .gloss_nodes import SPECULAR
 from .nodes import DEFAULT_ALBEDO
-from .preview import COLOUR_SOCKETS, DEFAULT_ROUGHNESS, shader_node, shown_material
+from .preview import DEFAULT_ROUGHNESS, shown_material
+from .shaders import COLOUR_SOCKETS, shader_node
 from .uv_maps import own_uv_name
 from .world import feeding, linear_pixels
 

@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What materials emit: Emission and Principled shaders, through Add and Mix Shader."""
+"""What materials and lamps emit, as numbers and in previews: Emission and Principled shaders, added and mixed."""
 from __future__ import annotations
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from .albedo import Images, by_material, socket_pictures
-from .preview import shader_node, surface_socket
+from .shaders import shader_node, surface_socket
 from .world import feeding
 
 # sockets of the shaders that emit: colour and strength
 _SOCKETS = {"EMISSION": ("Color", "Strength"), "BSDF_PRINCIPLED": ("Emission Color", "Emission Strength")}
 
+Emitter = tuple[bpy.types.NodeSocket, bpy.types.NodeSocket, float]  # colour, strength, and its part of the surface
 
-def emitters(socket: bpy.types.NodeSocket | None, part: float = 1.0
-             ) -> list[tuple[bpy.types.NodeSocket, bpy.types.NodeSocket, float]]:
-    """Colour, strength and part of each shader that emits and reaches an input, a material's or a lamp's."""
+
+def emitters(socket: bpy.types.NodeSocket | None, part: float = 1.0) -> list[Emitter]:
+    """The shaders that emit and reach an input, a material's or a lamp's."""
     output = None if socket is None else feeding(socket)
     if output is None:
         return []
@@ -27,39 +27,27 @@ def emitters(socket: bpy.types.NodeSocket | None, part: float = 1.0
     if node.type == "ADD_SHADER":
         return emitters(node.inputs[0], part) + emitters(node.inputs[1], part)
     if node.type == "MIX_SHADER":
-        second = float(np.clip(_number(node.inputs[0])[0], 0, 1))
+        second = float(np.clip(number(node.inputs[0])[0], 0, 1))
         return emitters(node.inputs[1], part * (1 - second)) + emitters(node.inputs[2], part * second)
     return []
 
 
-def radiance(socket: bpy.types.NodeSocket | None) -> NDArray[np.float64]:
-    """(3,) of the shaders that reach an input, W m^-2 sr^-1; what other nodes make counts as its socket's own value."""
-    return sum((part * _number(strength)[0] * _number(colour) for colour, strength, part in emitters(socket)),
-               np.zeros(3))
+def radiance(found: list[Emitter]) -> NDArray[np.float64]:
+    """(3,) of some shaders, W m^-2 sr^-1; what other nodes make counts as its socket's own value."""
+    return sum((part * number(strength)[0] * number(colour) for colour, strength, part in found), np.zeros(3))
 
 
-def triangle_emission(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArray[np.int32], known: Images
-                      ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[str]]:
-    """Radiance (F, 3) of the triangles with these face corners (F, 3), of images their mean over each.
-
-    Args:
-        obj, mesh, corners, known: as `albedo.triangle_finish`.
-    Returns:
-        It; which of them (F,) only emit, and reflect nothing; and the materials whose emission other nodes make, which
-        counts as the value of the socket that they feed.
-    """
-    out, alone, unread = np.zeros((len(corners), 3)), np.zeros(len(corners), bool), []
-    for material, here in by_material(obj, mesh):
-        found = emitters(surface_socket(material))
-        for colour, strength, part in found:
-            channels = np.arange(3)
-            pictures = socket_pictures(colour, mesh, corners[here], known, channels, channels, np.ones(3), np.zeros(3))
-            shown = pictures[0].lookups().mean(1) if pictures else _number(colour)
-            out[here] += part * _number(strength)[0] * shown
-            if material is not None and not (_plain(strength) and (pictures or _plain(colour))):
-                unread.append(material.name)
-        alone[here] = emits_alone(material)
-    return out, alone, unread
+def set_glow(shading: bpy.types.ShaderNodeGroup, found: list[Emitter]) -> None:
+    """Have the node of a preview add what some shaders of its material emit; one whose colour is made by nodes, so."""
+    shading.inputs["Glow"].default_value = (*radiance(found), 1.0)
+    if len(found) == 1 and not plain(found[0][0]):
+        colour, strength, part = found[0]
+        tree = shading.id_data
+        scaled = tree.nodes.new("ShaderNodeVectorMath")
+        scaled.operation = "SCALE"
+        scaled.inputs["Scale"].default_value = part * number(strength)[0]
+        tree.links.new(colour.links[0].from_socket, scaled.inputs[0])
+        tree.links.new(scaled.outputs[0], shading.inputs["Glow"])
 
 
 def emits_alone(material: bpy.types.Material | None) -> bool:
@@ -67,14 +55,14 @@ def emits_alone(material: bpy.types.Material | None) -> bool:
     return bool(emitters(surface_socket(material))) and shader_node(material) is None
 
 
-def _number(socket: bpy.types.NodeSocket) -> NDArray[np.float64]:
+def number(socket: bpy.types.NodeSocket) -> NDArray[np.float64]:
     """(3,) of an input, a colour or a number."""
     output = feeding(socket)
     source = output if output is not None and output.node.type in ("RGB", "VALUE") else socket
     return np.resize(np.array(source.default_value, float), 4)[:3]
 
 
-def _plain(socket: bpy.types.NodeSocket) -> bool:
-    """Whether `_number` is all that there is to an input."""
+def plain(socket: bpy.types.NodeSocket) -> bool:
+    """Whether `number` is all that there is to an input."""
     output = feeding(socket)
     return output is None or output.node.type in ("RGB", "VALUE")

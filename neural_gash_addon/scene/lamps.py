@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from ..backend.errors import UserError
 from ..backend.lit_scene import LitScene
 from ..backend.pictures import Picture
-from .albedo import Finish, Images, triangle_finish
-from .emission import radiance, triangle_emission
+from .albedo import Finish, Images, by_material, socket_pictures, triangle_finish
+from .emission import emits_alone, emitters, number, plain, radiance
 from .evaluation import evaluated, shown_objects
 from .frames import Array, as_array
 from .mesh_arrays import outward, to_world
+from .shaders import surface_socket
 from .solids import instances, solid_arrays
 from .world import lamp_energy
 
@@ -60,7 +61,7 @@ def read_lamps(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[L
 
     def finishing(solid: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArray[np.int32]) -> Finish:
         finish, pictures = triangle_finish(solid, mesh, corners, images)
-        emission, alone, names = triangle_emission(solid, mesh, corners, images)
+        emission, alone, names = _emission(solid, mesh, corners, images)
         unread.update(dict.fromkeys(names))
         finish[alone, :3] = 0
         return np.concatenate([finish, emission], axis=1), pictures
@@ -82,6 +83,30 @@ def read_lamps(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[L
         notice.append(f"Nodes make the emission of '{next(iter(unread))}', which counts as the value of the socket "
                       "that they feed.")
     return _joined(meshes, lamps), _key([*meshes, *lamps], _SAME * extent), " ".join(notice)
+
+
+def _emission(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArray[np.int32], known: Images
+                      ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[str]]:
+    """Radiance (F, 3) of the triangles with these face corners (F, 3), of images their mean over each.
+
+    Args:
+        obj, mesh, corners, known: as `albedo.triangle_finish`.
+    Returns:
+        It; which of them (F,) only emit, and reflect nothing; and the materials whose emission other nodes make, which
+        counts as the value of the socket that they feed.
+    """
+    out, alone, unread = np.zeros((len(corners), 3)), np.zeros(len(corners), bool), []
+    for material, here in by_material(obj, mesh):
+        found = emitters(surface_socket(material))
+        for colour, strength, part in found:
+            channels = np.arange(3)
+            pictures = socket_pictures(colour, mesh, corners[here], known, channels, channels, np.ones(3), np.zeros(3))
+            shown = pictures[0].lookups().mean(1) if pictures else number(colour)
+            out[here] += part * number(strength)[0] * shown
+            if material is not None and not (plain(strength) and (pictures or plain(colour))):
+                unread.append(material.name)
+        alone[here] = emits_alone(material)
+    return out, alone, unread
 
 
 def _joined(meshes: list[_Part], lamps: list[_Part]) -> LitScene:
@@ -150,7 +175,7 @@ def _energy(lamp: bpy.types.Object) -> Array:
     energy = lamp_energy(data)
     if getattr(data, "use_nodes", False) and data.node_tree is not None:
         output = next((o for o in map(data.node_tree.get_output_node, ("ALL", "CYCLES", "EEVEE")) if o), None)
-        energy = energy * radiance(output and output.inputs["Surface"])
+        energy = energy * radiance(emitters(output and output.inputs["Surface"]))
     if not (np.isfinite(energy).all() and energy.min() >= 0):
         raise UserError(f"The lamp '{lamp.name}' has a strength or colour that is negative, infinite or not a number.")
     return energy
