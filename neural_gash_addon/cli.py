@@ -55,6 +55,8 @@ def _parser() -> argparse.ArgumentParser:
     bake.add_argument("--occluders", default="self", metavar="self|visible|COLLECTION",
                       help="what casts shadows on the object (self)")
     bake.add_argument("--bounces", type=int, default=0, help="how often light may bounce between surfaces, at most (0)")
+    bake.add_argument("--lamps", action="store_true", help="bake the light of lamps and emissive materials "
+                      "too, to the tolerance or with as many paths as --rays")
     bake.add_argument("--texture", type=_side, metavar="SIDE",
                       help="bake to a texture of SIDE x SIDE texels instead; '50/m': so many texels a metre; 'fit': as "
                            "large as the tolerance needs (0.02 with --rays)")
@@ -180,7 +182,8 @@ def _relight(arguments: argparse.Namespace) -> tuple[list[dict], str]:
             raise UserError("A .npz has no World; give the light with --hdri.")
         arrays, record = exchange.load_npz(Path(arguments.input))
         light = rotated_light(file_light(arguments.hdri, record.order), *turn)
-        radiance = shading.radiance(arrays["transfer"], light).astype(np.float32)
+        radiance = shading.radiance(arrays["transfer"], light)
+        radiance = (radiance + arrays.get("irradiance", 0) / np.pi).astype(np.float32)
         if arguments.npz:
             exchange.write_npz(arguments.npz.absolute(), positions=arrays["positions"], radiance=radiance, light=light)
         name = Path(arguments.input).name
@@ -191,7 +194,7 @@ def _relight(arguments: argparse.Namespace) -> tuple[list[dict], str]:
         obj = choose([o for o in bpy.context.scene.objects if has_bake(o)], arguments.object, "baked")
         record = read_record(obj)
         if arguments.gloss and not can_gloss(record):
-            raise UserError(f"--gloss needs a bake to a texture without bounces, which that of '{obj.name}' is not.")
+            raise UserError(f"--gloss needs a texture without bounces or lamps, which the bake of '{obj.name}' is not.")
         scene = bpy.context.scene
         if arguments.hdri is None:
             lighting.take_light(scene)

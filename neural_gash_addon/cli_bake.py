@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -30,6 +31,8 @@ def check_bake(arguments: argparse.Namespace) -> None:
         raise UserError("With --uv-map a texture has no texels per metre; give --texture a number of texels, or fit.")
     if arguments.gloss and (arguments.texture is None or arguments.bounces):
         raise UserError("--gloss belongs to a bake with --texture and without --bounces.")
+    if arguments.gloss and arguments.lamps:
+        raise UserError("--gloss shows no lamps; leave out one of --gloss and --lamps.")
     if not methods.METHODS[arguments.method].traces and (arguments.rays is not None or arguments.bounces):
         raise UserError(f"The method '{arguments.method}' traces nothing; leave out --rays and --bounces.")
     if arguments.texture is not None and arguments.npz is not None:
@@ -65,6 +68,7 @@ def prepare_bake(arguments: argparse.Namespace, objects: list[bpy.types.Object],
         if settings.collection is None:
             raise UserError(f"There is no collection named '{arguments.occluders}' in the file.")
     set_number(settings, "bounces", arguments.bounces)
+    settings.lamps = arguments.lamps
     if arguments.texture is not None:
         settings.target = TEXTURE
         settings.sizing, size = arguments.texture
@@ -100,7 +104,7 @@ def finish_bake(arguments: argparse.Namespace, objects: Sequence[bpy.types.Objec
     if arguments.npz:
         (job,), (transfer,), (outcome,) = batch.jobs, results, outcomes
         assert isinstance(transfer, Transfer) and outcome.record is not None
-        exchange.save_npz(arguments.npz.absolute(), job.read.mesh, Transfer(transfer.coefficients, outcome.record))
+        exchange.save_npz(arguments.npz.absolute(), job.read.mesh, replace(transfer, record=outcome.record))
     if arguments.png:
         baked = {outcome.name for outcome in outcomes if outcome.record is not None}
         render_preview([o for o in objects if o.name in baked], arguments.png.absolute(),

@@ -109,6 +109,10 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
         name="Bounces", default=0, min=0, max=MAX_BOUNCES, soft_max=8,
         description="How often light may bounce from surface to surface, in their colours, at most: it stops by itself "
                     "where more would not be seen. 0: light comes from the sky alone")
+    lamps: BoolProperty(  # type: ignore[valid-type]
+        name="Lamps", default=False,
+        description="Bake the light of lamps and of materials that emit, too, with what all surfaces reflect of it in "
+                    "their colours. It is of everything that is visible, as it stands; spot lamps are left out")
     target: EnumProperty(  # type: ignore[valid-type]
         name="Target", description="Where the bake is kept", default=VERTICES,
         items=[(VERTICES, "Vertices", "Numbers at the vertices: quick, and enough for dense meshes"),
@@ -162,10 +166,13 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
     light_strength: FloatProperty(  # type: ignore[valid-type]
         name="Strength", default=1.0, min=0.0, max=1e9, soft_max=10.0,
         description="Brighten or dim the light of the previews", update=_light_changed)
+    lamps_strength: FloatProperty(  # type: ignore[valid-type]
+        name="Lamps", default=1.0, min=0.0, max=1e9, soft_max=10.0, update=_light_changed,
+        description="Brighten or dim the lamps that were baked, beside the other light; 0 switches them off")
     gloss: BoolProperty(  # type: ignore[valid-type]
         name="Glossy", default=False, update=_gloss_changed,
         description="Show what the materials mirror of the light, by their roughness, on objects baked to textures "
-                    "without bounces")
+                    "without bounces and lamps")
     lobe: EnumProperty(  # type: ignore[valid-type]
         name="Lobe", description="How materials spread what they mirror, by their roughness", default=GGX,
         update=_gloss_changed,

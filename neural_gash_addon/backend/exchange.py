@@ -71,11 +71,12 @@ def save_npz(path: Path, mesh: TriangleMesh, transfer: Transfer) -> None:
     """Write positions (N, 3), normals (N, 3), transfer (N, K), domain, elements (E,) and record (JSON text).
 
     For the POINT domain the points are the mesh's vertices in their order; for CORNER,
-    `elements` gives the point of each face corner.
+    `elements` gives the point of each face corner. `irradiance` (N, 3) is there where lamps were baked.
     """
+    lit = {} if transfer.irradiance is None else {"irradiance": transfer.irradiance}
     write_npz(path, positions=mesh.points.astype(np.float32), normals=mesh.normals.astype(np.float32),
               transfer=transfer.coefficients, domain=np.array(mesh.domain), elements=mesh.elements,
-              record=np.array(transfer.record.to_json()))
+              record=np.array(transfer.record.to_json()), **lit)
 
 
 def write_npz(path: Path, **arrays: NDArray) -> None:
@@ -87,20 +88,23 @@ def write_npz(path: Path, **arrays: NDArray) -> None:
 
 
 def load_npz(path: Path) -> tuple[dict[str, NDArray], BakeRecord]:
-    """The arrays of a file that `save_npz` wrote, and its record.
+    """The arrays of a file that `save_npz` wrote, `irradiance` where there is one, and its record.
 
     Raises:
         UserError: the file is missing, or no such file.
     """
     try:
         with np.load(path, allow_pickle=False) as data:
-            arrays = {key: data[key] for key in ("positions", "normals", "transfer", "domain")}
+            arrays = {key: data[key] for key in ("positions", "normals", "transfer", "domain", "irradiance")
+                      if key != "irradiance" or key in data}
             record = str(data["record"])
     except _UNREADABLE as error:
         raise UserError(f"'{path}' is missing or no bake that Neural GASh saved.") from error
     found = BakeRecord.from_json(record)
     transfer = arrays["transfer"]
     shape = (len(arrays["positions"]), found.order ** 2, 3)[:2 if found.colours == 1 else 3]
-    if transfer.dtype.kind != "f" or transfer.shape != shape:
+    irradiance = arrays.get("irradiance", np.zeros((shape[0], 3)))
+    if (transfer.dtype.kind != "f" or transfer.shape != shape or irradiance.dtype.kind != "f"
+            or irradiance.shape != (shape[0], 3)):
         raise UserError(f"'{path}' does not hold the coefficients that its record tells of.")
     return arrays, found

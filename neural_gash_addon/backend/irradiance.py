@@ -46,20 +46,22 @@ class Irradiance:
 
 
 def irradiance(scene: LitScene, points: NDArray, normals: NDArray, rays: int = RAYS, *, depth: int = DEPTH,
-               seed: int = 0, threads: int | None = None, occluders: Occluders | None = None
-               ) -> Generator[float, None, Irradiance]:
+               seed: int = 0, threads: int | None = None, occluders: Occluders | None = None,
+               clearance: NDArray | None = None) -> Generator[float, None, Irradiance]:
     """Light that arrives at points from all emitters, direct and reflected up to depth - 1 times.
 
     Args:
         points: (N, 3) metres. normals: (N, 3) unit; where it is zero, the irradiance is.
         rays: paths from each point, at least BATCHES; made a multiple of it.
         occluders: `scene.occluders()`, if it is there already.
+        clearance: (N, 3) from points to where their rays start (see TriangleMesh); along the normals where not given.
     Yields:
         Progress, 0 to 1. Closing the generator stops the workers.
     Raises:
         UserError: too few rays, no depth, or points that are not finite.
     """
     points, normals = np.asarray(points, np.float64), np.asarray(normals, np.float64)
+    clearance = normals if clearance is None else clearance
     if rays < BATCHES or depth < 1:
         raise UserError(f"Irradiance wants at least {BATCHES} rays a point and a depth of at least 1.")
     if not (np.isfinite(points).all() and np.isfinite(normals).all()):
@@ -75,7 +77,8 @@ def irradiance(scene: LitScene, points: NDArray, normals: NDArray, rays: int = R
 
     def part(job: tuple[NDArray, np.random.SeedSequence]) -> None:
         rows, own = job
-        batches = tracer.trace(points[rows], normals[rows], np.random.default_rng(own))  # (n, BATCHES, 3)
+        # (n, BATCHES, 3)
+        batches = tracer.trace(points[rows], normals[rows], clearance[rows], np.random.default_rng(own))
         values[rows] = batches.mean(1)
         error[rows] = batches.std(1, ddof=1) / BATCHES ** 0.5
 
@@ -106,16 +109,19 @@ class _Tracer:
         self._cumulative = np.cumsum(power).astype(np.float32)
         self._density = (brightness / power.sum()).astype(np.float32)                        # (F,)
         self._behind = np.ones(len(brightness), bool) if scene.front_only is None else ~np.asarray(scene.front_only)
+        # what rays may meet, too, is gathered twice
+        self._meeting = (np.arange(len(brightness)) < len(brightness) - scene.bodiless).astype(np.float32)   # (F,)
         bits = np.random.default_rng([seed, 6]).integers(0, 2**32, (_SETS, 1, 2), dtype=np.uint32)
         nets = sampling.owen_scramble(sampling.sobol2(paths)[None], bits)
         self._nets = ((nets.transpose(2, 0, 1) + 0.5) / 2.0 ** 32).astype(np.float32)        # (2, sets, paths)
 
-    def trace(self, points: NDArray, normals: NDArray, rng: np.random.Generator) -> NDArray[np.float64]:
+    def trace(self, points: NDArray, normals: NDArray, clearance: NDArray, rng: np.random.Generator
+              ) -> NDArray[np.float64]:
         """Irradiance at points (n, 3) by each batch of paths: (n, BATCHES, 3)."""
         each = BATCHES * self.paths
         count = len(points) * each
         gathered = np.zeros((3, count), np.float32)  # by each path, over pi
-        origins = self._occluders.origins(points, normals).T.repeat(each, axis=1)
+        origins = self._occluders.origins(points, clearance).T.repeat(each, axis=1)
         frames = sampling.frames(normals, np.zeros(len(normals))).astype(np.float32)
         tangents, bitangents, up = (frames[:, :, k].T.repeat(each, axis=1) for k in range(3))
         carried = np.ones((3, count), np.float32)
@@ -169,7 +175,7 @@ class _Tracer:
         free = self._occluders.blocked(_rows(origins.take(good, 1)), _rows(ways), np.ones(len(good), np.float32)) != 0
         good, faces = good[free], faces[free]
         form = above[good] * np.abs(facing[free]) / (np.float32(np.pi) * square[free] ** 2)
-        self._add(gathered, path, carried, good, faces, form / (self._density[faces] + form))
+        self._add(gathered, path, carried, good, faces, form / (self._density[faces] + self._meeting[faces] * form))
 
     def _gather_met(self, gathered: Floats, path: NDArray, carried: Floats, origins: Floats, directions: Floats,
                     cosine: Floats, faces: NDArray, u: Floats, v: Floats) -> None:

@@ -29,9 +29,10 @@ class LitScene:
     emission: NDArray[np.float64]     # (F, 3) radiance, W m^-2 sr^-1, 0 or more, the same in all directions
     pictures: Sequence[Picture] = ()  # that say the albedo (columns 0 to 2) from place to place
     front_only: NDArray[np.bool_] | None = None  # (F,) which emit from their front alone, as area lights; else both
+    bodiless: int = 0  # so many at the end emit, but no ray meets them: lamps, which block and reflect nothing
 
     def __post_init__(self) -> None:
-        if not len(self.triangles):
+        if not len(self.triangles) - self.bodiless:
             raise UserError(NO_FACES)
         if not np.isfinite(self.positions).all():
             raise UserError(NOT_FINITE)
@@ -100,6 +101,6 @@ class LitScene:
         return np.asarray(self.albedo, np.float32)
 
     def occluders(self) -> Occluders:
-        """For rays; triangles are numbered alike."""
+        """For rays; triangles are numbered alike, the bodiless ones left out."""
         resolution = float(np.spacing(np.float32(np.abs(self.positions).max())))
-        return Occluders([(self.positions, self.triangles)], resolution)
+        return Occluders([(self.positions, self.triangles[:len(self.triangles) - self.bodiless])], resolution)

@@ -16,6 +16,7 @@ from .bounce import BLACK, Reflection
 from .errors import UserError
 from .estimator import MAX_RAYS
 from .geometry import TEXEL, TriangleMesh
+from .lamps import Lamps
 from .plan import nothing_blocks
 from .progress import run as run  # the callers of `bake` drive it
 from .progress import scaled
@@ -89,7 +90,8 @@ METHODS: dict[str, Method] = {m.name: m for m in (
 
 def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: int | None = None,
          tolerance: float | None = None, occluders: Sequence[Geometry] = (), seed: int = 0,
-         threads: int | None = None, scene: Any = None, reflection: Reflection | None = None) -> Baking:
+         threads: int | None = None, scene: Any = None, reflection: Reflection | None = None,
+         lamps: Lamps | None = None) -> Baking:
     """Bake the transfer of a mesh's points.
 
     Args:
@@ -101,6 +103,7 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
         occluders: what else blocks, parts (positions (V, 3), triangles (F, 3)) in the same frame.
         scene: mesh and occluders as the method `sees` them, where they are there already from another bake.
         reflection: light that bounces, if any shall; for methods that trace.
+        lamps: what lights the points besides, if anything shall.
         seed: independent seeds give independent errors. threads: one a core where not given.
     Yields:
         Progress, 0 to 1, many times a second. `close()` stops the workers.
@@ -124,8 +127,10 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
     direct = partial(entry.bake, mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed,
                      threads=threads)
     if reflection is None or not entry.traces:
-        return direct(scene=scene)
-    return _with_bounces(direct, mesh, occluders, scene, threads, reflection)
+        baking = direct(scene=scene)
+    else:
+        baking = _with_bounces(direct, mesh, occluders, scene, threads, reflection)
+    return baking if lamps is None else _with_lamps(baking, mesh, lamps, seed, threads)
 
 
 def _with_bounces(direct: Callable[..., Baking], mesh: TriangleMesh, occluders: Sequence[Geometry],
@@ -138,3 +143,9 @@ def _with_bounces(direct: Callable[..., Baking], mesh: TriangleMesh, occluders: 
         scene = _embree_scene(mesh, occluders)
     transfer = yield from scaled(direct(scene=scene), 0, 0.6)
     return (yield from scaled(reflection.add(transfer, mesh, occluders, scene, threads), 0.6, 0.4))
+
+
+def _with_lamps(baking: Baking, mesh: TriangleMesh, lamps: Lamps, seed: int, threads: int | None) -> Baking:
+    """A bake of transfer, and then the irradiance from lamps."""
+    transfer = yield from scaled(baking, 0, 0.5)
+    return (yield from scaled(lamps.add(transfer, mesh, seed, threads), 0.5, 0.5))

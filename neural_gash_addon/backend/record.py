@@ -14,6 +14,7 @@ from .spherical_harmonics import MAX_ORDER
 SCHEMA = 1
 VERSION = "0.1.0"
 BASIS = "real orthonormal SH, no Condon-Shortley phase, k = l*(l+1)+m; radiance = albedo * (T . L)"
+LAMPS_BASIS = "; and + albedo * E / pi, E the irradiance from lamps, W/m^2, linear RGB"  # of bakes that have it
 _DAMAGED = "The record of this bake is damaged; bake again."
 # what JSON may hold for each kind of field
 _KINDS: dict[str, tuple[type, ...]] = {
@@ -46,6 +47,10 @@ class BakeRecord:
     bounces: int = 0                  # of diffuse interreflection that were computed
     colours: int = 1                  # transfer is (N, K), or (N, K, 3) where light bounced off colours
     plan: str = ""                    # why so, where it was planned: one sentence for each choice
+    lamps: str = ""                   # what tells the lamps, and all that they light, from others; '': none baked
+    lamps_rays: int = 0               # paths that their irradiance is made of
+    lamps_error: float | None = None  # rel L2 of the irradiance, measured
+    lamps_notice: str = ""            # what a person should know of them
     basis: str = BASIS
     version: str = VERSION
     schema: int = SCHEMA
@@ -59,6 +64,11 @@ class BakeRecord:
     def rays_per_point(self) -> float:
         """Mean number of rays a point took."""
         return self.rays / max(self.points, 1)
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers each point has, irradiance included."""
+        return self.terms + (3 if self.lamps else 0)
 
     def also(self, sentence: str) -> BakeRecord:
         """The same, with one sentence more of why, if it was planned."""

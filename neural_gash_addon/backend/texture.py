@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from .bounce import Reflection
 from .errors import UserError
 from .exchange import atomic, reason
 from .geometry import Surface
+from .lamps import Lamps
 from .progress import scaled
 from .raster import Layout
 from .raycast import Geometry
@@ -50,6 +51,7 @@ class TextureTransfer:
     coefficients: list[NDArray[np.float32]]  # of each tile, (n, K); coloured ones (n, 3K), red, green, blue of each
     inside: list[NDArray[np.bool_]]          # of each tile, (n,) texels whose centre is on the mesh, not beside
     record: BakeRecord
+    irradiance: list[NDArray[np.float32]] | None = None  # of each tile, (n, 3) W/m^2 from lamps, if baked too
 
     def fill_map(self) -> FillMap:
         """What the texels show that no face covers; see `texels.fill_map` and `texels.mirrored`."""
@@ -61,10 +63,16 @@ class TextureTransfer:
         return FillMap(source, *mirrored(covered.reshape(side, side), source))
 
     def image(self, index: int, filled: FillMap) -> NDArray[np.float32]:
-        """Numbers 4 * index .. 4 * index + 3 of the texels as an image (side * side, 4), row 0 at the bottom."""
+        """Numbers 4 * index .. 4 * index + 3 of the texels as an image (side * side, 4), row 0 at the bottom.
+
+        After those of the coefficients comes the irradiance, where there is one.
+        """
+        tiles, first = self.coefficients, CHANNELS * index
+        if self.irradiance is not None and index == image_count(self.record.terms):
+            tiles, first = self.irradiance, 0
         out = np.zeros((self.record.side ** 2, CHANNELS), np.float32)
-        for texels, coefficients in zip(self.texels, self.coefficients, strict=True):
-            part = coefficients[:, CHANNELS * index:CHANNELS * (index + 1)]
+        for texels, values in zip(self.texels, tiles, strict=True):
+            part = values[:, first:first + CHANNELS]
             out[texels, :part.shape[1]] = part
         image = out[filled.source]
         image[filled.outside] = 2 * image[filled.outside] - out[filled.inside]
@@ -80,7 +88,8 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
          side: int | None = None, texels_per_metre: float | None = None, padding: int = 2, rays: int | None = None,
          tolerance: float | None = None, occluders: Sequence[Geometry] = (),
          normal_maps: Sequence[NormalMap] = (), seed: int = 0, threads: int | None = None, folder: Path | None = None,
-         key: str = "", reflection: Reflection | None = None) -> Generator[float, None, TextureTransfer]:
+         key: str = "", reflection: Reflection | None = None, lamps: Lamps | None = None
+         ) -> Generator[float, None, TextureTransfer]:
     """Bake the transfer of a texture's texels.
 
     Args:
@@ -91,7 +100,7 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
             met by every tile.
         folder: where finished tiles are kept, so that a bake that was killed goes on from there and
             gives the same numbers. key: what tells this bake from others in the same folder.
-        reflection: light that bounces, if any shall.
+        reflection: light that bounces, if any shall. lamps: what lights the texels besides.
     Yields:
         Progress, 0 to 1.
     Raises:
@@ -106,7 +115,7 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
     store = _Store(folder, f"{key} {side} {digest}") if folder is not None else None
     scene: Any = None
     rows = max(1, _TILE // side)
-    texels, coefficients, inside, records = [], [], [], []
+    texels, values, inside, records = [], [], [], []
     for number, start in enumerate(range(0, side, rows)):
         stop = min(start + rows, side)
         coverage = layout.coverage(start, stop)
@@ -120,20 +129,26 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
             if scene is None and (sees := methods.METHODS[method].sees):
                 scene = sees(mesh, occluders)
             baking = methods.bake(mesh, method, order, rays=rays, tolerance=tolerance, seed=_tile_seed(seed, number),
-                                  occluders=occluders, threads=threads, scene=scene, reflection=reflection)
+                                  occluders=occluders, threads=threads, scene=scene, reflection=reflection,
+                                  lamps=lamps)
             transfer = yield from scaled(baking, done, share)
             found = transfer.coefficients.reshape(len(mesh.points), -1), transfer.record
+            if transfer.irradiance is not None:
+                found = np.concatenate([found[0], transfer.irradiance], axis=1), found[1]
             if store:
                 found = store.save(number, *found)
         texels.append(coverage.texels)
-        coefficients.append(found[0])
+        values.append(found[0])
         inside.append(np.all(coverage.barycentric == coverage.centres, axis=1))
         records.append(found[1])
     if not texels:
         raise UserError("The UVs leave no face any room in the texture, so there is nothing to bake.")
-    record = replace(_whole(records, [_energy(c) for c in coefficients]), seconds=time.perf_counter() - began,
-                     seed=seed, target="texture", side=side, single_faces=placed.single_faces)
-    return TextureTransfer(uv, texels, coefficients, inside, record)
+    terms = records[0].terms
+    coefficients = [v[:, :terms] for v in values]
+    irradiance = None if lamps is None else [v[:, terms:] for v in values]
+    record = replace(_whole(records, map(_energy, coefficients), map(_energy, irradiance or ())), seed=seed,
+                     seconds=time.perf_counter() - began, target="texture", side=side, single_faces=placed.single_faces)
+    return TextureTransfer(uv, texels, coefficients, inside, record, irradiance)
 
 
 def alike(transfers: Sequence[TextureTransfer]) -> list[TextureTransfer]:
@@ -155,35 +170,44 @@ def merged(transfers: Sequence[TextureTransfer]) -> TextureTransfer:
     for number, transfer in enumerate(transfers):
         for texels, inside in zip(transfer.texels, transfer.inside, strict=True):
             owner[texels[inside]] = number
-    kept = [(texels[keep], coefficients[keep], inside[keep])
+    kept = [(texels[keep], coefficients[keep], inside[keep], irradiance[keep])
             for number, t in enumerate(transfers)
-            for texels, coefficients, inside in zip(t.texels, t.coefficients, t.inside, strict=True)
+            for texels, coefficients, inside, irradiance in zip(t.texels, t.coefficients, t.inside,
+                                                                t.irradiance or t.coefficients, strict=True)
             for keep in [(owner[texels] == number) | (owner[texels] < 0)]]
-    record = _whole([t.record for t in transfers], [sum(map(_energy, t.coefficients)) for t in transfers])
+    lit = first.irradiance is not None
+    record = _whole([t.record for t in transfers], [sum(map(_energy, t.coefficients)) for t in transfers],
+                    [sum(map(_energy, t.irradiance or ())) for t in transfers])
     record = replace(record, seconds=sum(t.record.seconds for t in transfers), fingerprint="", uv_map="",
                      single_faces=sum(t.record.single_faces for t in transfers), frame=IDENTITY,
                      bounces=max(t.record.bounces for t in transfers))
-    return TextureTransfer(first.uv, [k[0] for k in kept], [k[1] for k in kept], [k[2] for k in kept], record)
+    return TextureTransfer(first.uv, [k[0] for k in kept], [k[1] for k in kept], [k[2] for k in kept], record,
+                           [k[3] for k in kept] if lit else None)
 
 
 def _tile_seed(seed: int, number: int) -> int:
     return int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
 
 
-def _energy(coefficients: NDArray) -> float:
+def _energy(values: NDArray) -> float:
     """Sum of squares."""
-    return float(np.square(coefficients, dtype=np.float64).sum())
+    return float(np.square(values, dtype=np.float64).sum())
 
 
-def _whole(records: Sequence[BakeRecord], energies: Sequence[float]) -> BakeRecord:
-    """One record of all parts of a texture, whose coefficients have these energies."""
-    energy = np.array(energies)
-    errors = [r.error_estimate for r in records]
-    error = None
-    if all(e is not None for e in errors):
-        error = float((np.square(np.array(errors, float)) * energy).sum() / max(energy.sum(), 1e-300)) ** 0.5
+def _whole(records: Sequence[BakeRecord], energies: Iterable[float], lamps: Iterable[float]) -> BakeRecord:
+    """One record of all parts of a texture, whose coefficients have these energies, and whose irradiance those."""
     return replace(records[0], points=sum(r.points for r in records), rays=sum(r.rays for r in records),
-                   probe_rays=sum(r.probe_rays for r in records), error_estimate=error)
+                   probe_rays=sum(r.probe_rays for r in records), lamps_rays=sum(r.lamps_rays for r in records),
+                   error_estimate=_joint([r.error_estimate for r in records], energies),
+                   lamps_error=_joint([r.lamps_error for r in records], lamps))
+
+
+def _joint(errors: Sequence[float | None], energies: Iterable[float]) -> float | None:
+    """The relative L2 error of parts together; None where one of them has none."""
+    if any(error is None for error in errors):
+        return None
+    energy = np.array(list(energies))
+    return float((np.square(np.array(errors, float)) * energy).sum() / max(energy.sum(), 1e-300)) ** 0.5
 
 
 class _Store:
@@ -208,7 +232,7 @@ class _Store:
             coefficients = np.load(self._folder / f"{number:04d}.npy", mmap_mode="r")
         except (OSError, ValueError, UserError):
             return None
-        return (coefficients, record) if coefficients.shape == (points, record.terms) else None
+        return (coefficients, record) if coefficients.shape == (points, record.numbers) else None
 
     def save(self, number: int, coefficients: NDArray[np.float32], record: BakeRecord
              ) -> tuple[NDArray[np.float32], BakeRecord]:

@@ -16,3 +16,4 @@ class Transfer:
 
     coefficients: NDArray[np.float32]  # (N, K), or (N, K, 3) where light bounces off colours
     record: BakeRecord
+    irradiance: NDArray[np.float32] | None = None  # (N, 3) W/m^2 from lamps, where those were baked too

@@ -20,6 +20,7 @@ from ..backend.transfer import Transfer
 from ..properties import TEXTURE, NeuralGashSettings
 from ..scene.images import make_images, remove_unused
 from .job import Job, check, finish, prepare, size
+from .lamps import LampReader
 
 _PLACING = 0.1  # of the progress
 Result = Transfer | TextureTransfer | UserError
@@ -62,6 +63,7 @@ def prepare_batch(context: bpy.types.Context, objects: Sequence[bpy.types.Object
     refused: list[Outcome] = []
     meshes: dict[int, str] = {}
     group = [obj for obj in objects if obj is not None and obj.type == "MESH"]
+    lamps = LampReader(context, settings) if settings.lamps else None
     for obj in objects:
         if obj is not None and obj.data is not None and obj.data.session_uid in meshes:
             refused.append(Outcome(obj.name, None, f"'{obj.name}' has the same mesh as "
@@ -69,7 +71,7 @@ def prepare_batch(context: bpy.types.Context, objects: Sequence[bpy.types.Object
                                    "to bake it by itself."))
             continue
         try:
-            jobs.append(prepare(context, obj, settings, None if obj is None else tiles(obj), group))
+            jobs.append(prepare(context, obj, settings, None if obj is None else tiles(obj), group, lamps))
         except UserError as error:
             refused.append(Outcome("" if obj is None else obj.name, None, _named(obj, error, len(objects))))
             continue
@@ -130,10 +132,14 @@ def finish_batch(context: bpy.types.Context, batch: Batch, results: Sequence[Res
     outcomes = list(batch.refused)
     baked: list[tuple[Job, Transfer | TextureTransfer]] = []
     owners: list[bpy.types.Mesh] = []
+    lamps = LampReader(context, context.scene.neural_gash)  # as they are now
     for job, result in zip(batch.jobs, results, strict=True):
         try:
             if isinstance(result, UserError):
                 raise result
+            if job.lamps is not None and lamps.of(check(context, job)).key != job.lamps.key:
+                raise UserError(f"The lamps of '{job.name}', or what they light, were changed during the bake; bake "
+                                "again.")
             if batch.shared:
                 owners.append(check(context, job).data)
             baked.append((job, result))

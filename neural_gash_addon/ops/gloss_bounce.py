@@ -81,7 +81,7 @@ class NEURAL_GASH_OT_bake_gloss(Baking, bpy.types.Operator):
         obj = context.object
         record = read_record(obj)
         if not can_gloss(record):
-            raise UserError("Glossy bounces need a bake to a texture, without bounces of its own; bake one first.")
+            raise UserError("Glossy bounces need a bake to a texture, without bounces and lamps; bake one first.")
         if not staleness.same(obj, record, context.evaluated_depsgraph_get()):
             raise UserError(f"'{obj.name}' or what shadows it was changed since its bake; bake it again first.")
         if np.abs(turn_since(obj, record) - np.eye(3)).max() > _TURNED:

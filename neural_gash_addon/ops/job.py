@@ -18,6 +18,7 @@ from ..backend.atlas import Part, check_area, check_part
 from ..backend.errors import UserError
 from ..backend.exchange import check_folder
 from ..backend.geometry import Surface
+from ..backend.lamps import Lamps
 from ..backend.record import VERSION, BakeRecord
 from ..backend.resolution import fitting_side
 from ..backend.texels import NormalMap
@@ -43,6 +44,7 @@ from ..scene.read import (
 )
 from ..scene.reflection import check_attributes, read_reflection
 from ..scene.uv_maps import check_room, read_uv
+from .lamps import LampReader
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,15 +73,16 @@ class Job:
     frame: tuple[float, ...]
     texture: TextureOptions | None  # None: to vertices
     bounces: bool          # light was to bounce, so the albedo counts
+    lamps: Lamps | None    # what lights it besides, if that was wanted
 
 
 def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: NeuralGashSettings,
-            tiles: Path | None = None, group: Sequence[bpy.types.Object] = ()) -> Job:
+            tiles: Path | None = None, group: Sequence[bpy.types.Object] = (), lamps: LampReader | None = None) -> Job:
     """Read the object and what blocks its light.
 
     Args:
         tiles: a folder for the finished tiles of a texture, from which a bake that was killed goes on.
-        group: the objects that are baked together with it.
+        group: the objects that are baked together with it. lamps: of them, if they are to be baked too.
     Raises:
         UserError: that cannot be baked.
     """
@@ -96,6 +99,7 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
             check_attributes(settings.order)
         reflection = read_reflection(obj, mode, depsgraph, settings.bounces)
     occluders = read_occluders(obj, mode, depsgraph)
+    lit = lamps.of(obj) if lamps is not None else None
     bake: Callable[..., Generator[float, None, Transfer | TextureTransfer]]
     texture = None
     if settings.target == TEXTURE:
@@ -103,15 +107,16 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
         what = {"method": settings.method, "order": settings.order, "occluders": occluders, "normal_maps": maps}
         texture = _texture_options(obj, settings, read.surface, tiles, what)
         before = fingerprint(obj, depsgraph, mode, texture.part.uv, reflection is not None)
-        key = _key(settings, before, read.matrix, maps)
-        bake = partial(bake_texture, read.surface, **what, **quality, folder=tiles, reflection=reflection, key=key)
+        key = _key(settings, before, read.matrix, maps, lit)
+        bake = partial(bake_texture, read.surface, **what, **quality, folder=tiles, reflection=reflection, key=key,
+                       lamps=lit)
     else:
         before = fingerprint(obj, depsgraph, mode, bounces=reflection is not None)
-        key = _key(settings, before, read.matrix, ())
+        key = _key(settings, before, read.matrix, (), lit)
         bake = partial(methods.bake, read.mesh, settings.method, settings.order, **quality, occluders=occluders,
-                       reflection=reflection)
+                       reflection=reflection, lamps=lit)
     return Job(obj.session_uid, obj.name, read, bake, mode, before, key, read.frame, texture,
-               reflection is not None)
+               reflection is not None, lit)
 
 
 def occluder_mode(obj: bpy.types.Object, settings: NeuralGashSettings, group: Sequence[bpy.types.Object]) -> str:
@@ -154,7 +159,8 @@ def size(settings: NeuralGashSettings) -> dict:
             "texels_per_metre": settings.texels_per_metre if dense else None, "padding": settings.padding}
 
 
-def _key(settings: NeuralGashSettings, shape: str, matrix: NDArray, maps: Sequence[NormalMap]) -> str:
+def _key(settings: NeuralGashSettings, shape: str, matrix: NDArray, maps: Sequence[NormalMap], lamps: Lamps | None
+         ) -> str:
     """What tells a bake from any other, in one text."""
     digest = hashlib.blake2b(np.round(matrix, 6).tobytes(), digest_size=16)
     for normal_map in maps:
@@ -163,7 +169,8 @@ def _key(settings: NeuralGashSettings, shape: str, matrix: NDArray, maps: Sequen
     chosen = {name: getattr(settings, name) for name in
               ("method", "order", "quality", "rays", "tolerance", "sizing", "side", "texels_per_metre", "padding",
                "bounces", "share")}
-    return json.dumps({"version": VERSION, "shape": shape, "place": digest.hexdigest(), **chosen}, sort_keys=True)
+    return json.dumps({"version": VERSION, "shape": shape, "place": digest.hexdigest(),
+                       "lamps": "" if lamps is None else lamps.key, **chosen}, sort_keys=True)
 
 
 def check(context: bpy.types.Context, job: Job) -> bpy.types.Object:
@@ -232,6 +239,8 @@ def finish(context: bpy.types.Context, job: Job, transfer: Transfer | TextureTra
         alone = (f"{record.single_faces:,} of the faces of '{obj.name}' could not be unwrapped with their neighbours; "
                  "each has a place of its own in the UV map.")
         warning = f"{warning} {alone}" if warning else alone
+    if record.lamps_notice:
+        warning = f"{warning} {record.lamps_notice}".strip()
     return record, warning
 
 
@@ -245,6 +254,9 @@ def summary(record: BakeRecord) -> str:
         text += f", {record.rays_per_point:.0f} rays a point"
     if record.error_estimate is not None:
         text += f", estimated error {percent(record.error_estimate)}"
+    if record.lamps:
+        text += (f"; lamps with {record.lamps_rays / max(record.points, 1):.0f} paths a point"
+                 f", estimated error {percent(record.lamps_error or 0)}")
     return text
 
 

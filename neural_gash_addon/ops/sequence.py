@@ -195,6 +195,8 @@ class NEURAL_GASH_OT_bake_sequence(Baking, bpy.types.Operator):
         reason = bake_refusal(context)
         if not reason and context.scene.neural_gash.target == TEXTURE:
             reason = "A sequence is baked to vertices; choose them as the target."
+        if not reason and context.scene.neural_gash.lamps:
+            reason = "A sequence is baked without lamps; switch Lamps off in the settings."
         if reason:
             cls.poll_message_set(reason)
         return not reason

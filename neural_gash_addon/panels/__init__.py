@@ -101,6 +101,9 @@ class NEURAL_GASH_PT_main(_Panel, bpy.types.Panel):
             column.label(text=f"Rays: {record.rays_per_point:.0f} a point")
         if record.error_estimate is not None:
             column.label(text=f"Estimated error: {percent(record.error_estimate)}")
+        if record.lamps:
+            column.label(text=f"Lamps: estimated error {percent(record.lamps_error or 0)}")
+            _paragraph(column, record.lamps_notice)
 
 
 class NEURAL_GASH_PT_light(_Panel, bpy.types.Panel):
@@ -127,11 +130,14 @@ class NEURAL_GASH_PT_light(_Panel, bpy.types.Panel):
         layout.prop(settings, "light_rotation", slider=True)
         layout.prop(settings, "with_viewport")
         layout.prop(settings, "light_strength")
+        obj = context.object
+        record = _record(obj.data[RECORD]) if has_bake(obj) else ""
+        if isinstance(record, BakeRecord) and record.lamps:
+            layout.prop(settings, "lamps_strength")
         layout.prop(settings, "soften")
         layout.prop(settings, "gloss")
         if settings.gloss:
             layout.prop(settings, "lobe")
-        obj = context.object
         if settings.gloss and has_bake(obj):
             layout.operator("neural_gash.bake_gloss", icon="SHADING_RENDERED")
             if has_bounces(obj.data) and not bounces_shown(obj.data):
@@ -188,6 +194,9 @@ class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):
                 layout.prop(settings, "collection")
         if METHODS[settings.method].traces:
             layout.prop(settings, "bounces")
+        layout.prop(settings, "lamps")
+        if settings.lamps and not METHODS[settings.method].traces:
+            layout.prop(settings, "tolerance")
         layout.prop(settings, "target", expand=True)
         if settings.target == TEXTURE:
             self._texture(layout, settings, context.object)
@@ -198,7 +207,7 @@ class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):
             layout.prop_search(settings, "uv_map", obj.data, "uv_layers")
         layout.prop(settings, "sizing", expand=True)
         if settings.sizing == FIT:
-            if settings.quality == RAYS or not METHODS[settings.method].traces:
+            if settings.quality == RAYS or not (METHODS[settings.method].traces or settings.lamps):
                 layout.prop(settings, "tolerance")
         else:
             layout.prop(settings, "texels_per_metre" if settings.sizing == DENSITY and not settings.uv_map else "side")

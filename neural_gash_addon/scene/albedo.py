@@ -2,6 +2,7 @@
 """How an object's triangles reflect, from the base colours of its materials, their metal and their roughness."""
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import bpy
@@ -13,7 +14,8 @@ from ..backend.errors import UserError
 from ..backend.pictures import Picture
 from .gloss_nodes import SPECULAR
 from .nodes import DEFAULT_ALBEDO
-from .preview import COLOUR_SOCKETS, DEFAULT_ROUGHNESS, shader_node, shown_material
+from .preview import DEFAULT_ROUGHNESS, shown_material
+from .shaders import COLOUR_SOCKETS, shader_node
 from .uv_maps import own_uv_name
 from .world import feeding, linear_pixels
 
@@ -33,22 +35,29 @@ def triangle_finish(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArra
     Returns:
         The means over each triangle, and the images.
     """
+    out, pictures = np.empty((len(corners), 7)), []
+    for material, here in by_material(obj, mesh):
+        out[here], found = _finish(material, mesh, corners[here], known)
+        pictures += [replace(picture, triangles=here) for picture in found]
+    out = np.clip(np.nan_to_num(out), 0, 1)
+    for picture in pictures:
+        out[picture.triangles[:, None], picture.columns] = picture.lookups().mean(1)
+    return out, pictures
+
+
+def by_material(obj: bpy.types.Object, mesh: bpy.types.Mesh
+                ) -> Iterator[tuple[bpy.types.Material | None, NDArray[np.int64]]]:
+    """Each material of an object, as `triangle_finish` has it, and its triangles (f,), where it has any."""
     polygons = np.empty(len(mesh.loop_triangles), np.int32)
     mesh.loop_triangles.foreach_get("polygon_index", polygons)
     slots = np.empty(len(mesh.polygons), np.int32)
     mesh.polygons.foreach_get("material_index", slots)
     materials = [shown_material(slot.material.original if slot.material else None) for slot in obj.material_slots]
     slot_of = np.clip(slots[polygons], 0, max(len(materials) - 1, 0))
-    out, pictures = np.empty((len(corners), 7)), []
     for number, material in enumerate(materials or [None]):
         here = np.flatnonzero(slot_of == number)
         if len(here):
-            out[here], found = _finish(material, mesh, corners[here], known)
-            pictures += [replace(picture, triangles=here) for picture in found]
-    out = np.clip(np.nan_to_num(out), 0, 1)
-    for picture in pictures:
-        out[picture.triangles[:, None], picture.columns] = picture.lookups().mean(1)
-    return out, pictures
+            yield material, here
 
 
 def _finish(material: bpy.types.Material | None, mesh: bpy.types.Mesh, corners: NDArray, known: Images) -> Finish:
@@ -63,11 +72,12 @@ def _finish(material: bpy.types.Material | None, mesh: bpy.types.Mesh, corners: 
         out[:3] = _value(socket)
         if "Metallic" in node.inputs and not node.inputs["Metallic"].is_linked:
             metallic = float(np.clip(np.nan_to_num(node.inputs["Metallic"].default_value), 0, 1))
-        pictures = _pictures(socket, mesh, corners, known, np.arange(6), np.arange(6) % 3,
-                             np.repeat([1 - metallic, metallic], 3), np.repeat([0.0, SPECULAR * (1 - metallic)], 3))
+        pictures = socket_pictures(socket, mesh, corners, known, np.arange(6), np.arange(6) % 3,
+                                   np.repeat([1 - metallic, metallic], 3),
+                                   np.repeat([0.0, SPECULAR * (1 - metallic)], 3))
         if "Roughness" in node.inputs:
             out[6] = _value(node.inputs["Roughness"])[0]
-            pictures += _pictures(node.inputs["Roughness"], mesh, corners, known, *np.array([[6], [0], [1], [0]]))
+            pictures += socket_pictures(node.inputs["Roughness"], mesh, corners, known, *np.array([[6], [0], [1], [0]]))
     out[3:6] = SPECULAR + metallic * (out[:3] - SPECULAR)
     out[:3] *= 1 - metallic
     return out, pictures
@@ -81,8 +91,8 @@ def _value(socket: bpy.types.NodeSocket) -> NDArray[np.float64]:
     return np.resize(np.array(socket.default_value, float), 4)[:3]
 
 
-def _pictures(socket: bpy.types.NodeSocket, mesh: bpy.types.Mesh, corners: NDArray, known: Images,
-              columns: NDArray, channels: NDArray, gain: NDArray, offset: NDArray) -> list[Picture]:
+def socket_pictures(socket: bpy.types.NodeSocket, mesh: bpy.types.Mesh, corners: NDArray, known: Images,
+                    columns: NDArray, channels: NDArray, gain: NDArray, offset: NDArray) -> list[Picture]:
     """The image that an input takes its value from by UV, if it does."""
     output = feeding(socket)
     source = output.node if output is not None and output.name == "Color" else None

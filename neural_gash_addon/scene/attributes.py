@@ -4,7 +4,8 @@
 Attribute i holds numbers 4i..4i+3 of a point as red, green, blue, alpha of a FLOAT_COLOR: float32,
 signed, exact, and four of them for one of the 14 attributes that EEVEE can draw. The leading
 underscore makes the glTF exporter carry them. A point's numbers are its coefficients; coloured
-ones are K times red, green and blue.
+ones are K times red, green and blue. The irradiance from lamps, where those were baked too, is the red, green and
+blue of one more, `_prt_lamps`.
 """
 from __future__ import annotations
 
@@ -31,12 +32,18 @@ RECORD = "neural_gash"  # custom property on the mesh
 SEQUENCE = "neural_gash_sequence"  # another: the file that holds its bake of every frame of an animation
 PREFIX = "_prt_"
 CHANNELS = 4
-_OURS = re.compile(rf"{PREFIX}\d+")  # chosen as 'the' colour by Blender, not by a person
+LAMPS = f"{PREFIX}lamps"
+_OURS = re.compile(rf"{PREFIX}(\d+|lamps)")  # chosen as 'the' colour by Blender, not by a person
 
 
 def attribute_count(terms: int) -> int:
     """How many attributes the numbers of a point take."""
     return -(-terms // CHANNELS)
+
+
+def attribute_names(record: BakeRecord) -> list[str]:
+    """The attributes of a bake to vertices."""
+    return [f"{PREFIX}{i}" for i in range(attribute_count(record.terms))] + ([LAMPS] if record.lamps else [])
 
 
 def has_bake(obj: bpy.types.Object | None) -> bool:
@@ -59,10 +66,9 @@ def write_transfer(obj: bpy.types.Object, elements: NDArray[np.int32], transfer:
     domain = transfer.record.domain
     if len(elements) != len(data.vertices if domain == POINT else data.loops):
         raise UserError(f"'{obj.name}' was changed while it was being baked; bake again.")
-    count = attribute_count(transfer.record.terms)
-    own = _own_attributes(data)
-    names = {f"{PREFIX}{i}" for i in range(count)} - set(own)
-    taken = sorted(names & {*data.attributes.keys(), *obj.vertex_groups.keys()})  # groups share the name space
+    names = attribute_names(transfer.record)
+    there = {*data.attributes.keys(), *obj.vertex_groups.keys()}  # groups share the name space
+    taken = sorted((set(names) - set(_own_attributes(data))) & there)
     if taken:
         raise UserError(f"'{obj.name}' has an attribute or vertex group '{taken[0]}' that no bake of it made; "
                         "rename or remove it to bake.")
@@ -70,13 +76,15 @@ def write_transfer(obj: bpy.types.Object, elements: NDArray[np.int32], transfer:
     chosen = _chosen_attributes(data)
     terms = transfer.record.terms
     flat = transfer.coefficients.reshape(len(transfer.coefficients), terms)
+    parts = [flat[:, start:start + CHANNELS] for start in range(0, terms, CHANNELS)]
+    if transfer.irradiance is not None:
+        parts.append(transfer.irradiance)
     values = np.zeros((len(elements), CHANNELS), np.float32)
-    for index in range(count):
-        part = flat[:, CHANNELS * index:CHANNELS * (index + 1)]
-        width = min(CHANNELS, terms - CHANNELS * index)
+    for name, part in zip(names, parts, strict=True):
+        width = part.shape[1]
         values[:, :width] = part[elements]
         values[:, width:] = 0
-        attribute = data.attributes.new(f"{PREFIX}{index}", "FLOAT_COLOR", domain)
+        attribute = data.attributes.new(name, "FLOAT_COLOR", domain)
         attribute.data.foreach_set("color", values.ravel())
     _choose_attributes(data, chosen)
     data[RECORD] = transfer.record.to_json()
@@ -141,7 +149,7 @@ def check_whole(data: bpy.types.Mesh, record: BakeRecord) -> None:
         bake_images(data, record)
         return
     elements = len(data.vertices if record.domain == POINT else data.loops)
-    for name in (f"{PREFIX}{i}" for i in range(attribute_count(record.terms))):
+    for name in attribute_names(record):
         attribute = data.attributes.get(name)
         whole = (attribute is not None and attribute.data_type == "FLOAT_COLOR"
                  and attribute.domain == record.domain and len(attribute.data) == elements)
@@ -187,10 +195,10 @@ def _own_attributes(data: bpy.types.Mesh) -> list[str]:
         return []
     try:
         record = BakeRecord.from_json(data[RECORD])
-        count = 0 if record.domain == TEXEL else attribute_count(record.terms)
+        names = [] if record.domain == TEXEL else attribute_names(record)
     except UserError:
-        count = attribute_count(3 * MAX_ORDER ** 2)
-    return [name for name in (f"{PREFIX}{i}" for i in range(count))
+        names = [*(f"{PREFIX}{i}" for i in range(attribute_count(3 * MAX_ORDER ** 2))), LAMPS]
+    return [name for name in names
             if name in data.attributes and data.attributes[name].data_type == "FLOAT_COLOR"]
 
 

@@ -18,8 +18,8 @@ _transfer: dict[tuple[int, ...], NDArray[np.float32]] = {}  # images' session ui
 
 
 def can_gloss(record: BakeRecord) -> bool:
-    """Whether a bake can be shown glossy: a texture, of transfer that no colour is in yet."""
-    return record.side > 0 and record.colours == 1
+    """Whether a bake can be shown glossy: a texture, of transfer that no colour is in yet, and no lamps beside it."""
+    return record.side > 0 and record.colours == 1 and not record.lamps
 
 
 def gloss_group(data: bpy.types.Mesh, record: BakeRecord, lobe: str) -> bpy.types.NodeTree:

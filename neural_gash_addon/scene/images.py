@@ -25,11 +25,11 @@ RECORD = "neural_gash"         # custom property of an image: the record of the 
 
 def make_images(name: str, transfer: TextureTransfer, folder: Path | None, half: bool, parts: str = "",
                 label: str = "prt", owners: Sequence[bpy.types.Mesh] = ()) -> list[bpy.types.Image]:
-    """New images that hold a texture bake, four coefficients each.
+    """New images that hold a texture bake, four coefficients each, and one of the irradiance, if there is one.
 
     Args:
         folder: where the files go; they are packed into the .blend where not given.
-        half: 16 bits a channel instead of 32.
+        half: 16 bits a channel instead of 32; not for irradiance, which may be of any size.
         parts: what the record does not say of each object that shares the texture, as JSON.
         label: what the files are called after the object.
         owners: the meshes that the images are for, whose earlier files are replaced.
@@ -46,6 +46,11 @@ def make_images(name: str, transfer: TextureTransfer, folder: Path | None, half:
             image.pack()
             image.filepath_raw = f"//{Path(image.filepath_raw).name}"  # the file itself is going
         return images
+
+
+def _names(record: BakeRecord) -> list[str]:
+    """What tells the images of a bake apart: numbers, then that of the irradiance, where it has one."""
+    return [*map(str, range(image_count(record.terms))), *(["lamps"] if record.lamps else [])]
 
 
 def attach(data: bpy.types.Mesh, images: Sequence[bpy.types.Image], key: str = TRANSFER) -> None:
@@ -74,7 +79,7 @@ def bake_images(data: bpy.types.Mesh, record: BakeRecord, key: str = TRANSFER) -
         UserError: one is missing, cannot be loaded, has another size, or belongs to another bake.
     """
     images = [image for image in _attached(data, key) if image is not None]
-    if len(images) != image_count(record.terms):
+    if len(images) != len(_names(record)):
         raise UserError(f"The bake of '{data.name}' has lost some of its images; bake again.")
     for image in images:
         if not image.packed_file:
@@ -126,7 +131,11 @@ def _plain(path: Path | str) -> str:
 
 def _paths(folder: Path, stem: str, record: BakeRecord) -> list[Path]:
     """The image files of a bake."""
-    return [folder / f"{stem}_{number}.exr" for number in range(image_count(record.terms))]
+    return [folder / f"{stem}_{name}.exr" for name in _names(record)]
+
+
+def _is_lamps(path: Path) -> bool:
+    return path.stem.endswith("_lamps")
 
 
 def _write(stem: str, transfer: TextureTransfer, folder: Path, half: bool, parts: str) -> list[Path]:
@@ -151,7 +160,7 @@ def _write(stem: str, transfer: TextureTransfer, folder: Path, half: bool, parts
         with ExitStack() as drafts:  # which take their places together, once all are whole
             for number, path in enumerate(paths):
                 image = transfer.image(number, filled).reshape(side, side, 4)
-                exr.write(drafts.enter_context(atomic(path)), image, text, half)
+                exr.write(drafts.enter_context(atomic(path)), image, text, half and not _is_lamps(path))
             beside = drafts.enter_context(atomic(record_file))
             beside.write_text((f'{text[:-1]}, "objects": {parts}}}' if parts else text) + "\n")
     except OSError as error:
@@ -162,12 +171,12 @@ def _write(stem: str, transfer: TextureTransfer, folder: Path, half: bool, parts
 def _load(name: str, paths: list[Path], record: BakeRecord, half: bool) -> list[bpy.types.Image]:
     """The files as images whose numbers mean themselves."""
     images = []
-    for number, path in enumerate(paths):
+    for path, part in zip(paths, _names(record), strict=True):
         image = bpy.data.images.load(str(path), check_existing=False)
-        image.name = f"{name} PRT {number}"
+        image.name = f"{name} PRT {part}"
         image.colorspace_settings.name = "Non-Color"
         image.alpha_mode = "CHANNEL_PACKED"
-        image.use_half_precision = half
+        image.use_half_precision = half and not _is_lamps(path)
         image[RECORD] = record.to_json()
         if bpy.data.is_saved:
             with suppress(ValueError):  # another drive, on Windows

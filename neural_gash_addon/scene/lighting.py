@@ -106,6 +106,8 @@ def apply_light(scene: bpy.types.Scene) -> None:
 @persistent
 def _on_change(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Turn the light of previews whose object was turned: it is kept in the frame of the bake."""
+    if _LIGHT not in scene:
+        return  # as below; and the white sky that lights previews before any was taken is the same however it is turned
     for update in depsgraph.updates:
         if isinstance(update.id, bpy.types.Object) and update.is_updated_transform:
             obj = update.id.original
@@ -184,8 +186,9 @@ def light_object(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
     try:
         record, view = read_record(obj), scene.neural_gash.view
         if view == LIT:
-            update_light(obj, current_light(scene, record.order))
+            update_light(obj, current_light(scene, record.order), lamps=scene.neural_gash.lamps_strength)
         else:
-            update_light(obj, view_light(obj, record, view, scene.neural_gash.coefficient), tint=0.0)
+            update_light(obj, view_light(obj, record, view, scene.neural_gash.coefficient), tint=0.0,
+                         lamps=0.0)
     except UserError:
         return  # the panel says that the bake is damaged

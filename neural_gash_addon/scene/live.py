@@ -157,6 +157,8 @@ def _followable(obj: bpy.types.Object, rendered: bool = False) -> BakeRecord:
     record = read_record(obj)
     if record.domain == TEXEL:
         raise UserError(f"'{obj.name}' is baked to a texture; live updates are for bakes to vertices.")
+    if record.lamps:
+        raise UserError(f"Lamps light the bake of '{obj.name}'; live updates are for bakes without lamps.")
     if record.colours != 1 and not rendered:
         raise UserError(f"Light bounces in the bake of '{obj.name}'; it is followed in rendered frames only.")
     return record

@@ -15,17 +15,18 @@ from ..backend import spherical_harmonics as sh
 from ..backend.errors import UserError
 from ..backend.geometry import TEXEL
 from ..backend.record import BakeRecord
-from .attributes import attribute_count, check_whole, has_bake, read_record
+from .attributes import attribute_names, check_whole, has_bake, read_record
+from .emission import emits_alone, emitters, set_glow
 from .frames import as_array, bake_frame
 from .gloss import can_gloss, gloss_group, gloss_whole, light_gloss
 from .gloss_nodes import SPECULAR, is_gloss, lobe_of
 from .images import bake_images, remove_unused
 from .nodes import DEFAULT_ALBEDO, ensure_group, group_terms, is_group, set_light
+from .shaders import COLOUR_SOCKETS, has_nodes, shader_node, surface_socket, upstream
 
 _STATE = "neural_gash_preview"  # custom property of a preview material: what its slot held
 EEVEE_ATTRIBUTES = 14           # with 15, EEVEE draws magenta, whatever their types
 DEFAULT_ROUGHNESS = 0.5         # of a material that says nothing of it
-COLOUR_SOCKETS = {"BSDF_PRINCIPLED": "Base Color", "BSDF_DIFFUSE": "Color"}
 _TEXTURES_ON_UV = {"TEX_IMAGE"}
 
 
@@ -58,13 +59,14 @@ def preview_on(obj: bpy.types.Object, lobe: str = "") -> None:
     if lobe and can_gloss(record):
         group = gloss_group(obj.data, record, lobe)
     else:
-        group = ensure_group(record.order, record.colours, images, record.uv_map if images else "")
+        group = ensure_group(record.order, record.colours, images, record.uv_map if images else "",
+                             bool(record.lamps))
     originals = [slot.material for slot in obj.material_slots] or [None]
     previews: list[bpy.types.Material] = []
     try:
         for original in originals:
             previews.append(_preview_material(original, group))
-            _check_attributes(original, previews[-1], record.order, 1 if images else attribute_count(record.terms))
+            _check_attributes(original, previews[-1], record.order, 1 if images else len(attribute_names(record)))
     except UserError:
         _remove_unused(previews)
         raise
@@ -106,13 +108,13 @@ def preview_off(obj: bpy.types.Object) -> None:
     _remove_unused(found)
 
 
-def update_light(obj: bpy.types.Object, light: NDArray, tint: float = 1.0) -> None:
+def update_light(obj: bpy.types.Object, light: NDArray, tint: float = 1.0, lamps: float = 1.0) -> None:
     """Light the preview of `obj`, where it is on. Sets socket values only, so no shader recompiles.
 
     Args:
         light: (K, 3) in world axes, of the bake's order or higher. It is turned into the frame of
             the bake, so the object may have been rotated since.
-        tint: how much of the materials' colours a dull preview shows.
+        tint: how much of the materials' colours a dull preview shows. lamps: factor on the light of baked lamps.
     Raises:
         UserError: the record of the bake is damaged.
         ValueError: the light is of a lower order than the bake.
@@ -125,7 +127,8 @@ def update_light(obj: bpy.types.Object, light: NDArray, tint: float = 1.0) -> No
         raise ValueError(f"the light has {len(light)} coefficients, the bake {terms}")
     turn = turn_since(obj, record)
     seen = sh.rotate(np.asarray(light)[:terms], turn)
-    if any(not is_gloss(node.node_tree) and group_terms(node.node_tree) != (record.order, record.colours)
+    holds = record.order, record.colours, bool(record.lamps)
+    if any(not is_gloss(node.node_tree) and group_terms(node.node_tree) != holds
            for node in _group_nodes(obj)):
         preview_on(obj)  # baked again at another order
     for node in _group_nodes(obj):
@@ -139,7 +142,7 @@ def update_light(obj: bpy.types.Object, light: NDArray, tint: float = 1.0) -> No
         if is_gloss(node.node_tree):
             light_gloss(obj.data, record, node, seen, turn)
         else:
-            set_light(node, seen, tint)
+            set_light(node, seen, tint, lamps)
 
 
 def turn_since(obj: bpy.types.Object, record: BakeRecord) -> NDArray:
@@ -164,18 +167,13 @@ def _group_nodes(obj: bpy.types.Object) -> list[bpy.types.Node]:
             if node.type == "GROUP" and (is_group(node.node_tree) or is_gloss(node.node_tree))]
 
 
-def _has_nodes(material: bpy.types.Material) -> bool:
-    """Whether the material is made of nodes; from 5.0 on all are, and asking warns."""
-    return bpy.app.version >= (5, 0, 0) or material.use_nodes
-
-
 def _preview_material(original: bpy.types.Material | None, group: bpy.types.NodeTree) -> bpy.types.Material:
     """A material whose surface is the group with the original's colour as albedo."""
-    if original is None or not _has_nodes(original):
+    if original is None or not has_nodes(original):
         name = "Material" if original is None else original.name
         colour = (DEFAULT_ALBEDO,) * 3 + (1.0,) if original is None else tuple(original.diffuse_color)
         preview = bpy.data.materials.new(f"{name} (PRT preview)")
-        if not _has_nodes(preview):
+        if not has_nodes(preview):
             preview.use_nodes = True
         preview.node_tree.nodes.clear()
         source = None
@@ -187,6 +185,7 @@ def _preview_material(original: bpy.types.Material | None, group: bpy.types.Node
         source = _colour_socket(preview)
         colour = (DEFAULT_ALBEDO,) * 3 + (1.0,) if source is None else tuple(source.default_value)
     tree = preview.node_tree
+    glowing, alone = emitters(surface_socket(preview)), emits_alone(preview)
     for node in [n for n in tree.nodes if n.type == "OUTPUT_MATERIAL"]:
         tree.nodes.remove(node)
     shading = tree.nodes.new("ShaderNodeGroup")
@@ -194,6 +193,10 @@ def _preview_material(original: bpy.types.Material | None, group: bpy.types.Node
     shading.inputs["Albedo"].default_value = colour
     if source is not None and source.is_linked:
         tree.links.new(source.links[0].from_socket, shading.inputs["Albedo"])
+    if "Glow" in shading.inputs:
+        set_glow(shading, glowing)
+        if alone:
+            shading.inputs["Albedo"].default_value = (0, 0, 0, 1)
     if is_gloss(group):
         _set_gloss(tree, shading, None if source is None else source.node)
     output = tree.nodes.new("ShaderNodeOutputMaterial")
@@ -242,41 +245,16 @@ def shown_material(material: bpy.types.Material | None) -> bpy.types.Material | 
     return material if state is None else state.get("shown")
 
 
-def shader_node(material: bpy.types.Material | None) -> bpy.types.Node | None:
-    """The first Principled or Diffuse shader that reaches the output of a material."""
-    if material is None or not _has_nodes(material) or material.node_tree is None:
-        return None
-    tree = material.node_tree
-    output = next((o for o in map(tree.get_output_node, ("ALL", "EEVEE", "CYCLES")) if o is not None), None)
-    if output is None:
-        return None
-    return next((node for node in _upstream(output.inputs["Surface"]) if node.type in COLOUR_SOCKETS), None)
-
-
 def _colour_socket(material: bpy.types.Material) -> bpy.types.NodeSocket | None:
     """The colour input of a material's shader."""
     node = shader_node(material)
     return None if node is None else node.inputs[COLOUR_SOCKETS[node.type]]
 
 
-def _upstream(*sockets: bpy.types.NodeSocket) -> list[bpy.types.Node]:
-    """The nodes that feed some input sockets, nearest first, each once."""
-    found: dict[bpy.types.Node, None] = {}
-    front = list(sockets)
-    while front:
-        nodes = [link.from_node for socket in front for link in socket.links]
-        front = []
-        for node in nodes:
-            if node not in found:
-                found[node] = None
-                front += node.inputs
-    return list(found)
-
-
 def _check_attributes(original: bpy.types.Material | None, preview: bpy.types.Material, order: int, bake: int) -> None:
     """UserError where the preview reads more of the mesh's attributes than EEVEE can draw."""
     output = preview.node_tree.get_output_node("ALL")
-    reads = _mesh_reads(_upstream(output.inputs["Surface"]))
+    reads = _mesh_reads(upstream(output.inputs["Surface"]))
     if original is not None and len(reads) > EEVEE_ATTRIBUTES:
         raise UserError(f"The colour of the material '{original.name}' reads {len(reads) - bake} attributes "
                         f"of the mesh; with the {bake} of an order-{order} bake that is more than the "
@@ -289,7 +267,7 @@ def _mesh_reads(nodes: list[bpy.types.Node]) -> set[tuple[str, str]]:
     for node in nodes:
         if node.type == "GROUP" and node.node_tree is not None:
             ends = [n for n in node.node_tree.nodes if n.type == "GROUP_OUTPUT"]
-            reads |= _mesh_reads(_upstream(*(socket for end in ends for socket in end.inputs)))
+            reads |= _mesh_reads(upstream(*(socket for end in ends for socket in end.inputs)))
         elif node.type == "ATTRIBUTE" and node.attribute_type == "GEOMETRY":
             reads.add(("attribute", node.attribute_name))
         elif node.type == "VERTEX_COLOR":

@@ -16,7 +16,7 @@ from ..backend.errors import UserError
 from ..backend.geometry import Surface, TriangleMesh, unit
 from .albedo import Finish, Images, triangle_finish
 from .attributes import RECORD, discard
-from .evaluation import evaluated, revealed, shown_objects
+from .evaluation import evaluated, revealed
 from .frames import Array, as_array, bake_frame, rotation_part
 from .mesh_arrays import (
     check_coordinates,
@@ -30,6 +30,7 @@ from .mesh_arrays import (
 )
 from .normal_maps import normal_map_key
 from .preview import preview_off
+from .solids import Finishing, Solid, instances
 from .uv_maps import mark_own_uv, own_uv_name
 
 SELF, VISIBLE = "SELF", "VISIBLE"
@@ -191,15 +192,19 @@ def read_occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgr
 def read_finish(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph) -> Finish:
     """`triangle_finish` of the triangles of `obj`, then of those of `read_occluders`, in its order."""
     known: Images = {}
+
+    def finishing(solid: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArray[np.int32]) -> Finish:
+        return triangle_finish(solid, mesh, corners, known)
+
     with evaluated(obj, depsgraph) as copy:
         mesh = copy.to_mesh()
         try:
-            own = triangle_finish(copy, mesh, read_triangle_corners(mesh), known)
+            own = finishing(copy, mesh, read_triangle_corners(mesh))
         finally:
             copy.to_mesh_clear()
     values: list[Array] = []
     pictures = []
-    others = ((finish, matrix) for _, _, finish, matrix in _occluders(obj, mode, depsgraph, known))
+    others = ((finish, matrix) for _, _, finish, matrix in _occluders(obj, mode, depsgraph, finishing))
     for (found, images), matrix in [(own, as_array(obj.matrix_world)), *others]:
         start = sum(map(len, values))
         pictures += [replace(image, triangles=start + image.triangles, uv=outward(image.uv, matrix))
@@ -281,77 +286,22 @@ def same_fingerprint(first: str, second: str) -> bool:
     return a.shape == b.shape and bool(np.allclose(a, b, rtol=2 * _SAME, atol=2 * _SAME))
 
 
-def _occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph, images: Images | None = None,
-               ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int32], Finish, Array]]:
-    """(local positions, triangles, finish, world matrix) of each object and instance that blocks, but `obj`.
-
-    The finish is empty unless `images`, which `triangle_finish` wants, are given: they take time to read.
+def _occluders(obj: bpy.types.Object, mode: str, depsgraph: bpy.types.Depsgraph, finishing: Finishing | None = None,
+               ) -> Iterator[Solid]:
+    """Each object and instance that blocks, but `obj`. Their finish is empty where it is not asked for: it takes time.
     """
     if mode == SELF:
         return
     if mode == VISIBLE:
-        yield from _instances(depsgraph, None, obj, images)
+        yield from instances(depsgraph, None, obj, finishing)
         return
     members = _members(mode)
     hidden = [o for o in members if o != obj and not o.visible_get(view_layer=depsgraph.view_layer)]
     owners = {o.session_uid for o in members} - {o.session_uid for o in hidden}
-    yield from _instances(depsgraph, owners, obj, images)
+    yield from instances(depsgraph, owners, obj, finishing)
     if hidden:
         with revealed(hidden, depsgraph) as (own_depsgraph, _):
-            yield from _instances(own_depsgraph, None, None, images)
-
-
-def _instances(depsgraph: bpy.types.Depsgraph, owners: set[int] | None, baked: bpy.types.Object | None,
-               images: Images | None,
-               ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int32], Finish, Array]]:
-    """The solid objects and instances of a depsgraph; of the objects in `owners` only, where given.
-
-    `baked` itself is left out, but instances of it elsewhere are not.
-    """
-    known: dict[tuple[int, int], tuple[NDArray, NDArray, Finish] | None] = {}
-    shown = shown_objects(depsgraph.view_layer) if owners is None else set()
-    for instance in depsgraph.object_instances:
-        solid = instance.object
-        if solid.type != "MESH" or not instance.show_self:  # curves, texts and balls come as meshes too
-            continue
-        owner = (instance.parent if instance.is_instance else solid).original
-        if owner == baked and not instance.is_instance:
-            continue
-        if owners is None and (owner.session_uid not in shown or solid.original.hide_render):
-            continue
-        if owners is not None and owner.session_uid not in owners:
-            continue
-        key = (solid.data.as_pointer(), solid.original.session_uid)
-        if key not in known:
-            known[key] = _solid_arrays(solid, images)
-        arrays = known[key]
-        matrix = as_array(instance.matrix_world)
-        if arrays is not None and np.isfinite(matrix).all():
-            yield *arrays, matrix
-
-
-def _solid_arrays(solid: bpy.types.Object, images: Images | None
-                  ) -> tuple[NDArray[np.float32], NDArray[np.int32], Finish] | None:
-    """Local positions, triangles and their finish of an evaluated object; None where it has no faces."""
-    try:
-        mesh = solid.to_mesh()
-    except RuntimeError:  # Blender's way to say that the object has no geometry, as a second metaball
-        return None
-    if mesh is None:
-        return None
-    try:
-        if not len(mesh.polygons):
-            return None
-        positions = read_positions(mesh)
-        corners = read_triangle_corners(mesh)
-        triangles = read_corner_vertices(mesh)[corners]
-        whole = np.isfinite(positions).all(axis=1)[triangles].all(axis=1)
-        finish, pictures = ((np.zeros((len(whole), 7)), []) if images is None
-                            else triangle_finish(solid, mesh, corners, images))
-        return (np.nan_to_num(positions), triangles[whole],
-                (finish[whole], [picture.only(whole) for picture in pictures]))
-    finally:
-        solid.to_mesh_clear()
+            yield from instances(own_depsgraph, None, None, finishing)
 
 
 def _hash_shading(mesh: bpy.types.Mesh, digest) -> None:

@@ -14,6 +14,7 @@ from ..backend.errors import UserError
 from ..backend.record import BakeRecord
 from .attributes import check_whole, has_bake, read_record
 from .gloss_bounce import finish_fits, finish_key, has_bounces
+from .lamps import read_lamps
 from .preview import is_preview
 from .read import SELF, fingerprint, read_finish, same_fingerprint
 from .uv_maps import read_uv
@@ -58,10 +59,11 @@ def fits(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
 
 
 def same(obj: bpy.types.Object, record: BakeRecord, depsgraph: bpy.types.Depsgraph) -> bool:
-    """Whether the object's shape, and what shadows it, are those of a bake. Raises UserError as `fingerprint`."""
+    """Whether the object's shape, what shadows it and lamps are those of a bake. Raises UserError, as `fingerprint`."""
     uv = read_uv(obj.data, record.uv_map) if record.uv_map else None
     now = fingerprint(obj, depsgraph, record.occluders, uv, record.colours == 3)
-    return same_fingerprint(now, record.fingerprint)
+    return (same_fingerprint(now, record.fingerprint)
+            and (not record.lamps or read_lamps(obj, depsgraph)[1] == record.lamps))
 
 
 def register() -> None:
@@ -89,7 +91,8 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     uids = {update.id.original.session_uid for update in depsgraph.updates
             if isinstance(update.id, bpy.types.Object)
             and (update.is_updated_geometry or update.is_updated_transform)}
-    if any(isinstance(update.id, bpy.types.Material) and not is_preview(update.id.original)
+    if any(isinstance(update.id, bpy.types.Light)
+           or isinstance(update.id, bpy.types.Material) and not is_preview(update.id.original)
            for update in depsgraph.updates):
         uids.update(obj.session_uid for obj in scene.objects if _reflects(obj))
     if uids:
@@ -154,10 +157,11 @@ def _gloss_fits(obj: bpy.types.Object, record: BakeRecord, depsgraph: bpy.types.
 
 
 def _reflects(obj: bpy.types.Object) -> bool:
-    """Whether the bake depends on materials."""
+    """Whether the bake depends on materials, or on lamps and so on all."""
     try:
         record = read_record(obj) if has_bake(obj) else None
-        return record is not None and (has_bounces(obj.data) or record.colours == 3 or bool(record.uv_map))
+        return record is not None and (has_bounces(obj.data) or record.colours == 3
+                                       or bool(record.uv_map or record.lamps))
     except UserError:
         return False
 
@@ -165,6 +169,7 @@ def _reflects(obj: bpy.types.Object) -> bool:
 def _has_occluders(obj: bpy.types.Object) -> bool:
     """Whether the bake depends on other objects too."""
     try:
-        return read_record(obj).occluders != SELF
+        record = read_record(obj)
+        return record.occluders != SELF or bool(record.lamps)
     except UserError:
         return False

@@ -244,10 +244,16 @@ def _suns(depsgraph: bpy.types.Depsgraph) -> list[tuple[Array, Array]]:
 
 def _irradiance(sun: bpy.types.SunLight) -> Array:
     """Irradiance (3,) of a sun lamp on a plane that faces it; its nodes, if any, are not read."""
-    irradiance = np.array(sun.color, dtype=np.float64) * sun.energy
-    irradiance *= 2.0 ** getattr(sun, "exposure", 0.0)     # from 4.5 on
-    if getattr(sun, "use_temperature", False):             # from 4.5 on
-        irradiance *= np.array(sun.temperature_color, dtype=np.float64)
+    irradiance = lamp_energy(sun)
     if not getattr(sun, "normalize", True):                # then the energy is a radiance
         irradiance *= math.pi * math.sin(sun.angle / 2) ** 2
     return irradiance
+
+
+def lamp_energy(lamp: bpy.types.Light) -> Array:
+    """Colour times strength (3,) of a lamp, in the unit that its type has it in."""
+    energy = np.array(lamp.color, dtype=np.float64) * lamp.energy
+    energy *= 2.0 ** getattr(lamp, "exposure", 0.0)     # from 4.5 on
+    if getattr(lamp, "use_temperature", False):         # from 4.5 on
+        energy *= np.array(lamp.temperature_color, dtype=np.float64)
+    return energy

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What lamps add to a bake: irradiance at its points, to the same tolerance."""
+from __future__ import annotations
+
+import time
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from .geometry import TriangleMesh
+from .irradiance import BATCHES, Irradiance, irradiance
+from .lit_scene import LitScene
+from .progress import scaled
+from .raycast import Occluders
+from .record import LAMPS_BASIS
+from .transfer import Transfer
+
+_PILOT = 0.1  # of the progress
+FEWEST, MOST = 32, 4096  # paths from a point, to begin with and where the tolerance is not met before
+
+
+@dataclass(eq=False)
+class Lamps:
+    """What a bake with lamps wants."""
+
+    scene: LitScene           # in the frame of the bake, metres
+    key: str                  # what tells it from others
+    notice: str = ""          # what of the lamps is not in it
+    rays: int | None = None   # paths from every point, or
+    tolerance: float | None = None  # relative L2 error to reach
+
+    @cached_property
+    def _occluders(self) -> Occluders:
+        return self.scene.occluders()
+
+    def add(self, transfer: Transfer, mesh: TriangleMesh, seed: int, threads: int | None
+            ) -> Generator[float, None, Transfer]:
+        """The transfer of a mesh's points with the irradiance at them."""
+        began = time.perf_counter()
+        found, rays = yield from self._traced(mesh, seed, threads)
+        record = replace(transfer.record, lamps=self.key, lamps_rays=rays * len(mesh.points),
+                         lamps_error=relative(found),
+                         lamps_notice=" ".join(filter(None, (found.notice, self.notice))),
+                         basis=transfer.record.basis + LAMPS_BASIS,
+                         seconds=transfer.record.seconds + time.perf_counter() - began)
+        return replace(transfer, irradiance=found.values, record=record)
+
+    def _traced(self, mesh: TriangleMesh, seed: int, threads: int | None
+                ) -> Generator[float, None, tuple[Irradiance, int]]:
+        """Irradiance, and its paths from each point: as many again as there are until the error is small enough."""
+        rays = -(-(self.rays or FEWEST) // BATCHES) * BATCHES
+        tolerance = np.inf if self.tolerance is None else self.tolerance
+        found: Irradiance | None = None
+        done = 0
+        start, share = 0.0, 1.0 if self.tolerance is None else _PILOT  # of the progress
+        for number in range(MOST):
+            more = yield from scaled(irradiance(
+                self.scene, mesh.points, mesh.normals, rays, seed=_seed(seed, number), threads=threads,
+                occluders=self._occluders, clearance=mesh.clearance), start, share)
+            found = more if found is None else _mean(found, more)
+            done, start = done + rays, start + share
+            error = relative(found)
+            if error <= tolerance or done >= MOST:
+                break
+            rays = done
+            wanted = min(MOST, done * (error / tolerance) ** 2)
+            share = (1 - start) * min(1, rays / (wanted - done))
+        assert found is not None
+        return found, done
+
+
+def relative(found: Irradiance) -> float:
+    """Relative L2 error, by the standard errors of all points and channels; 0 where it is dark."""
+    energy = float(np.square(found.values, dtype=np.float64).sum())
+    return float(np.square(found.error, dtype=np.float64).sum() / energy) ** 0.5 if energy else 0.0
+
+
+def _mean(first: Irradiance, second: Irradiance) -> Irradiance:
+    """Of two with as many paths each."""
+    return Irradiance((first.values + second.values) / 2, np.hypot(first.error, second.error) / 2, first.notice)
+
+
+def _seed(seed: int, number: int) -> int:
+    return int(np.random.SeedSequence([seed, 7, number]).generate_state(1)[0])
