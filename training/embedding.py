@@ -138,22 +138,24 @@ def network(model: nn.Module, sample: Sample) -> NDArray:
     return found.T.cpu().numpy() * sample.level
 
 
-def sphere(sample: Sample) -> NDArray:
+def sphere(sample: Sample, rows: NDArray) -> NDArray:
     """(n, 3) reflected light in an integrating sphere of the room's mean albedo and mean light off surfaces."""
     share = sample.layout.areas / sample.layout.areas.sum()
     first = share @ (sample.points[:, 6:] * sample.direct)
-    return np.tile(first / (1 - share @ sample.points[:, 6:]), (len(held_rows(sample)), 1))
+    return np.tile(first / (1 - share @ sample.points[:, 6:]), (len(rows), 1))
 
 
-def one_bounce(sample: Sample) -> NDArray:
+def one_bounce(sample: Sample, rows: NDArray) -> NDArray:
     """(n, 3) light off scene points, each a disc, as if nothing stood between; the sphere's for further bounces."""
-    rows, areas = held_rows(sample), sample.layout.areas
-    way = sample.points[None, :, :3] - sample.queries[rows, None, :3]
-    square = np.square(way).sum(2)
-    here = np.einsum("nmx,nx->nm", way, sample.queries[rows, 3:6]).clip(0)
-    there = -np.einsum("nmx,mx->nm", way, sample.points[:, 3:6]).clip(max=0)
-    form = here * there * areas / np.pi / (square * (square + areas / np.pi)).clip(1e-20)
-    return form @ (sample.points[:, 6:] * sample.direct) / (1 - areas @ sample.points[:, 6:] / areas.sum())
+    areas, out = sample.layout.areas, []
+    for some in np.array_split(rows, -(-len(rows) // 1024)):
+        way = sample.points[None, :, :3] - sample.queries[some, None, :3]
+        square = np.square(way).sum(2)
+        here = np.einsum("nmx,nx->nm", way, sample.queries[some, 3:6]).clip(0)
+        there = -np.einsum("nmx,mx->nm", way, sample.points[:, 3:6]).clip(max=0)
+        form = here * there * areas / np.pi / (square * (square + areas / np.pi)).clip(1e-20)
+        out.append(form @ (sample.points[:, 6:] * sample.direct))
+    return np.concatenate(out) / (1 - areas @ sample.points[:, 6:] / areas.sum())
 
 
 def near_mean(queries: NDArray, points: NDArray, light: NDArray, count: int) -> NDArray[np.float32]:
@@ -165,13 +167,14 @@ def near_mean(queries: NDArray, points: NDArray, light: NDArray, count: int) -> 
     return np.einsum("nk,nkc->nc", weight / weight.sum(1, keepdims=True), light[near]).astype(np.float32)
 
 
-def nearest_points(count: int) -> Callable[[Sample], NDArray]:
-    """`near_mean` at `held_rows`, of one look."""
-    return lambda sample: near_mean(sample.queries[held_rows(sample)], sample.points, sample.looks[0], count)
+def nearest_points(count: int) -> Callable[[Sample, NDArray], NDArray]:
+    """`near_mean` of the first look, at some queries."""
+    return lambda sample, rows: near_mean(sample.queries[rows], sample.points, sample.looks[0], count)
 
 
-BASELINES: dict[str, Callable[[Sample], NDArray]] = {
-    "integrating sphere": sphere, "one bounce off scene points, unshadowed": one_bounce,
+# reflected light at some queries of a room, without training
+BASELINES: dict[str, Callable[[Sample, NDArray], NDArray]] = {
+    "integrating sphere": sphere, "one bounce off scene points": one_bounce,
     **{f"mean of the {count} nearest scene points": nearest_points(count) for count in (16, 64, 256)}}
 
 
@@ -200,8 +203,8 @@ def train(recipe: Recipe, kept: list[Path], held: list[Sample], seed: int, check
 def table(model: nn.Module, held: list[Sample]) -> str:
     """The network beside what needs no training."""
     lines = [f"{'mean of the rooms, and in brackets the median':46}{'relative':>18}{'squares':>18}{'logarithms':>18}"]
-    for name, give in {"network": lambda sample: network(model, sample), **BASELINES}.items():
-        found = [judged(give(sample), sample) for sample in held]
+    for name, give in {"network": lambda sample, _: network(model, sample), **BASELINES}.items():
+        found = [judged(give(sample, held_rows(sample)), sample) for sample in held]
         columns = [[each[key] for each in found] for key in found[0]]
         lines.append(f"{name:46}" + "".join(f"{np.mean(each):9.4f} ({np.median(each):.4f})" for each in columns))
     return "\n".join(lines)

@@ -47,7 +47,7 @@ class Settings:
     neighbours: int = 16   # k of the decoder: more gain little (docs/embedding.md)
 
 
-SMALL = Settings(width=64, blocks=4, hidden=32)              # an hour of one CPU core
+SMALL = Settings(width=64, blocks=2, hidden=32)              # an hour of one busy CPU core
 FULL = Settings(width=256, blocks=14, hidden=128, neighbours=32)  # as large as the paper's Table 3
 
 
