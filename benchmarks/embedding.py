@@ -17,7 +17,7 @@ import numpy as np
 from memory import _megabytes
 
 POINTS = (4096, 12_800, 51_200, 200_000)
-QUERIES = (16_384, 65_536, 262_144, 1_000_000)
+QUERIES = (16_384, 65_536, 262_144, 1_048_576)
 FEW = 16_384  # queries of a room when its points vary, and
 USUAL = 4096  # points of a room when its queries vary
 
@@ -28,30 +28,32 @@ def _child(count: int, queries: int) -> None:
     import torch
 
     from neural_gash_addon.backend import embedding_bake, methods
+    from neural_gash_addon.backend.lit_points import LitPoints
     from neural_gash_addon.backend.networks.embedding import SMALL, Embedding
 
     torch.set_num_threads(1)
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
 
-    def surface(number: int) -> np.ndarray:
+    def surface(number: int) -> LitPoints:
         axis, side = rng.integers(0, 3, number), rng.integers(0, 2, number)
         positions = rng.random((number, 3)) * [8, 6, 3]
         positions[np.arange(number), axis] = side * np.array([8, 6, 3])[axis]
         normals = np.zeros((number, 3))
         normals[np.arange(number), axis] = 1 - 2 * side
-        return np.concatenate([positions, normals, rng.random((number, 3))], 1).astype(np.float32)
+        return LitPoints(*(each.astype(np.float32) for each in (positions, normals, *rng.random((3, number, 3)))))
 
-    model, points, asked = Embedding(SMALL).eval(), surface(count), surface(queries)
-    lamp = (points[:, 5] < 0) & (np.abs(points[:, :2] - [4, 3]).max(1) < 0.5)
-    points = np.concatenate([points, np.where(lamp[:, None], 10, 0).repeat(3, 1)], 1).astype(np.float32)
-    methods.run(embedding_bake.Room(model, points[:1024]).irradiance(asked[:1024]))  # warm
+    def asked(room: embedding_bake.Room, queries: LitPoints) -> None:
+        methods.run(room.reflected(queries.places, queries.normals, queries.direct))
+
+    model, points, asking = Embedding(SMALL).eval(), surface(count), surface(queries)
+    asked(embedding_bake.Room(model, surface(1024)), surface(1024))  # warm
     start, began = _megabytes("VmRSS"), time.process_time()
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak counts anew from here
     room = embedding_bake.Room(model, points)
     encoded, encoding = time.process_time(), _megabytes("VmHWM")
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    methods.run(room.irradiance(asked))
+    asked(room, asking)
     print(json.dumps({"encode": encoded - began, "decode": time.process_time() - encoded, "encode_mb": encoding - start,
                       "decode_mb": _megabytes("VmHWM") - start}))
 

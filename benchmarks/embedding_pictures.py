@@ -3,13 +3,14 @@
 
 `python benchmarks/embedding_pictures.py --rooms 4 --out docs`: a table, and embedding_rooms.png. From the left: 64
 paths a pixel, as many as the network's time allows, the network, the reference. One thread, processor seconds; the
-network's include sampling the scene, encoding and decoding.
+network's include sampling and lighting the scene points, encoding, tracing direct light and decoding.
 """
 from __future__ import annotations
 
 import argparse
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +19,12 @@ from scipy.ndimage import gaussian_filter
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from neural_gash_addon.backend import embedding_bake, irradiance, methods
-from neural_gash_addon.backend.scene_points import scene_points
-from training import room_labels, room_views, rooms
+from neural_gash_addon.backend import embedding, embedding_bake, irradiance, methods
+from neural_gash_addon.backend.lit_points import STRAIGHT, lit_points
+from training import embedding as judging
+from training import room_labels, room_views
 
-REFERENCE, USUAL = 1024, 64  # paths
+REFERENCE, USUAL = 3072, 64  # paths
 
 
 def ssim(one: NDArray, other: NDArray) -> float:
@@ -36,7 +38,7 @@ def ssim(one: NDArray, other: NDArray) -> float:
     return float(((2 * a * b + 1e-4) * (2 * both + 9e-4) / ((a ** 2 + b ** 2 + 1e-4) * (variances + 9e-4))).mean())
 
 
-def timed(make):
+def timed(make: Callable[[], NDArray]) -> tuple[NDArray, float]:
     """What a function gives, and the processor seconds that it takes."""
     began = time.process_time()
     made = make()
@@ -46,8 +48,9 @@ def timed(make):
 def main() -> None:
     """Print the table, write the picture."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rooms", type=int, default=4)
-    parser.add_argument("--width", type=int, default=128)
+    parser.add_argument("--rooms", type=int, default=4, help="of the split evaluation, after the Cornell box")
+    parser.add_argument("--width", type=int, default=96)
+    parser.add_argument("--reference", type=int, default=REFERENCE, help="paths")
     parser.add_argument("--out", type=Path, default=Path("out"))
     arguments = parser.parse_args()
     import torch
@@ -55,27 +58,38 @@ def main() -> None:
 
     torch.set_num_threads(1)
     model = embedding_bake.network().cpu()
-    width, height = arguments.width, arguments.width * 3 // 4
     strips, sums = [], {}
     print("| room | light | s | MSE | SSIM | rel. MSE |\n|---|---|---|---|---|---|")
-    for seed in (job.seed for job in room_labels.jobs(arguments.rooms, room_labels.VALIDATION, REFERENCE)):
-        scene = rooms.generate(seed)
+    for job in room_labels.evaluation(arguments.rooms, None, REFERENCE):
+        scene, cornell = room_labels.scene_of(job), job.seed == room_labels.CORNELL
         occluders = scene.occluders()
-        seen = room_views.view(scene, *room_views.camera(scene, seed, occluders), width, height, occluders)
+        width, height = arguments.width, arguments.width * 3 // 4
+        where = room_views.CORNELL if cornell else room_views.camera(scene, job.seed, occluders)
+        seen = room_views.view(scene, *where, width, height, occluders)
+        places, normals = seen.queries[:, :3], seen.queries[:, 3:6]
 
-        def traced(rays: int, start: int, scene=scene, seen=seen, occluders=occluders) -> NDArray:
-            return methods.run(irradiance.irradiance(scene, seen.queries[:, :3], seen.queries[:, 3:6], rays, seed=start,
-                                                     threads=1, occluders=occluders)).values
+        def traced(rays: int, start: int, scene=scene, places=places, normals=normals, occluders=occluders, **how
+                   ) -> NDArray:
+            return methods.run(irradiance.irradiance(scene, places, normals, rays, seed=start, threads=1,
+                                                     occluders=occluders, **how)).values
 
-        def asked(scene=scene, seen=seen, seed=seed) -> NDArray:
-            room = embedding_bake.Room(model, scene_points(scene, room_labels.POINTS, seed))
-            return methods.run(room.irradiance(seen.queries))
+        def asked(scene=scene, places=places, normals=normals, occluders=occluders, traced=traced) -> NDArray:
+            direct = traced(STRAIGHT, 4, depth=1)
+            room = embedding_bake.Room(model, methods.run(lit_points(scene, occluders, threads=1)))
+            return direct + methods.run(room.reflected(places, normals, direct))
 
-        truth = traced(REFERENCE, 1)
-        usual, usual_seconds = timed(lambda: traced(USUAL, 2))
+        def untrained(seen=seen, places=places, scene=scene, occluders=occluders, traced=traced) -> dict[str, NDArray]:
+            points, direct = methods.run(lit_points(scene, occluders, threads=1)), traced(STRAIGHT, 4, depth=1)
+            every = np.concatenate([points.places, points.normals, points.albedo], 1)
+            sample = judging.Sample(every, points.direct, points.indirect[None], seen.queries, None, None, None,
+                                    embedding.layout(points.places, 32, 16), None, None)
+            return {name: direct + give(sample, np.arange(len(places))) for name, give in judging.BASELINES.items()}
+
+        truth = traced(arguments.reference, 1)
+        usual, usual_seconds = timed(lambda traced=traced: traced(USUAL, 2))
         found, seconds = timed(asked)
         rays = max(8, 8 * round(USUAL * seconds / usual_seconds / 8))
-        equal, equal_seconds = timed(lambda rays=rays: traced(rays, 3))
+        equal, equal_seconds = timed(lambda rays=rays, traced=traced: traced(rays, 3))
         exposed = 2.5 * float(np.median(truth.mean(1)))
 
         def shown(light: NDArray, seen=seen, exposed=exposed) -> NDArray:
@@ -84,12 +98,14 @@ def main() -> None:
 
         strips.append(np.concatenate([shown(light) for light in (usual, equal, found, truth)], 1))
         for name, light, spent in ((f"{USUAL} paths", usual, usual_seconds), ("paths, same time", equal, equal_seconds),
-                                   ("network", found, seconds)):
+                                   ("network", found, seconds),
+                                   *((f"direct and {name}", light, float("nan"))
+                                     for name, light in untrained().items())):
             row = (spent, float(np.square(shown(light) - shown(truth)).mean()), ssim(shown(light), shown(truth)),
                    float(np.square(light - truth).sum() / np.square(truth).sum()))
             sums.setdefault(name, []).append(row)
             label = f"{rays} {name}" if light is equal else name
-            print(f"| {seed} | {label} | " + " | ".join(f"{value:.4g}" for value in row) + " |")
+            print(f"| {job.seed} | {label} | " + " | ".join(f"{value:.4g}" for value in row) + " |", flush=True)
     for name, found_rows in sums.items():
         print(f"| mean | {name} | " + " | ".join(f"{value:.4g}" for value in np.mean(found_rows, 0)) + " |")
     arguments.out.mkdir(parents=True, exist_ok=True)

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Train the light-transport embedding: label rooms, then `python -m training.embedding`; writes weights and a log.
 
-As Xu et al. 2026: relative L2 in log space, points in space and not pictures. A room turned about the
-vertical or mirrored is another room; each colour channel is one, too. Brighter lamps would be nothing new, as the
-network is linear in emission.
+As Xu et al. 2026: relative L2, points in space and not pictures. Rooms are neither turned nor moved, as the network
+gives the same for those by construction; each colour channel is a room of its own, and the scene points' light has
+another noise in each of room_labels.LOOKS looks.
 """
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -19,23 +20,14 @@ from torch import Tensor, nn
 
 from neural_gash_addon.backend import embedding, weights
 from neural_gash_addon.backend.nearest import nearest_to
-from neural_gash_addon.backend.networks.embedding import (
-    FULL,
-    SMALL,
-    Embedding,
-    Layout,
-    Settings,
-    direct,
-    level,
-    shining,
-)
+from neural_gash_addon.backend.networks.embedding import FULL, SMALL, Embedding, Frame, Settings, level
 
 from . import data, loop
 from .curves import draw
 
 CACHE = data.CACHE / "rooms"
-EPSILON = 0.1        # of equation 12, which leaves it open: errors below a tenth of the level are mostly noise
-HELD_OUT = 512       # queries of a room, when it is judged
+EPSILON = 0.1        # of the level: errors below it are mostly noise
+HELD_OUT = 1024      # queries of a room, when it is judged
 NAME = "embedding"
 
 
@@ -51,97 +43,72 @@ class Recipe:
     every: int     # steps, the held-out rooms are looked at and all is saved
 
 
-RECIPES = {"small": Recipe(SMALL, 4_000, 5e-4, 1, 1024, 250),            # an hour of one CPU core
-           "full": Recipe(FULL, 2_000_000, 2e-4, 3, 8192, 10_000)}       # Table 3
+RECIPES = {"small": Recipe(SMALL, 4_000, 1e-3, 1, 2048, 200),            # an hour of one CPU core
+           "full": Recipe(FULL, 200_000, 2e-4, 4, 2048, 2_000)}
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """A labelled room, with what never changes however it is turned."""
+    """A labelled room, with what never changes of it."""
 
-    points: NDArray[np.float32]       # (M, 12) position, normal, albedo, emission
-    queries: NDArray[np.float32]      # (N, 9) position, normal, albedo
-    irradiance: NDArray[np.float32]   # (N, 3)
-    noise: NDArray[np.float32]        # (N, 3) its standard error
-    areas: NDArray[np.float32]        # (M,)
-    direct: NDArray[np.float32]       # (3, M) unshadowed, at scene points
-    asked: NDArray[np.float32]        # (3, N) the same at queries
+    points: NDArray[np.float32]     # (M, 9) position, normal, albedo
+    direct: NDArray[np.float32]     # (M, 3) light straight from emitters, there
+    looks: NDArray[np.float32]      # (LOOKS, M, 3) reflected light there, noisy
+    queries: NDArray[np.float32]    # (N, 9) position, normal, albedo
+    asked: NDArray[np.float32]      # (N, 3) light straight from emitters
+    truth: NDArray[np.float32]      # (N, 3) reflected light
+    noise: NDArray[np.float32]      # (N, 3) its standard error
     layout: embedding.Layout
-    near: NDArray[np.int32]           # (N, k) codes nearest to each query
+    near: NDArray[np.int32]         # (N, k) codes nearest to each query
+    guide: NDArray[np.float32]      # (N, 3) about the truth, with a noise of its own: mean of scene points
 
     @property
     def level(self) -> NDArray[np.float32]:
-        """(3,)."""
-        return level(*(torch.from_numpy(array) for array in (self.points[:, 6:9].T, self.points[:, 9:].T, self.areas))
-                     ).numpy()
+        """(3,) of the first look."""
+        return level(torch.from_numpy(self.looks[0].T), torch.from_numpy(self.layout.areas)).numpy()
 
 
 @cache
 def load(path: Path, settings: Settings) -> Sample:
     """A room of the cache, kept in memory."""
     with np.load(path) as found:
-        points, queries, irradiance, noise = (
-            found[key] for key in ("scene_points", "queries", "irradiance", "noise"))
-    stages = len(settings.depths)
-    layout = embedding.layout(points[:, :3], stages, settings.gathered, settings.around)
-    near = nearest_to(queries[:, :3], points[:len(layout.around[0]), :3], settings.neighbours)
-    areas = embedding.areas(points[:, :3])
-    emission = torch.from_numpy(points[:, 9:].T)
-    rows, lamp_areas = shining(emission, torch.from_numpy(areas))
-    lamps = torch.from_numpy(points)[rows]
-    unshadowed = (direct(*(torch.from_numpy(each) for each in (at[:, :3], at[:, 3:6])), lamps[:, :3], lamps[:, 3:6],
-                         lamp_areas, emission[:, rows]).numpy() for at in (points, queries))
-    return Sample(points, queries, irradiance, noise, areas, *unshadowed, layout, near.astype(np.int32))
+        points, direct, looks, queries, asked, truth, noise = (found[key] for key in (
+            "scene_points", "point_direct", "point_indirect", "queries", "direct", "indirect", "indirect_noise"))
+    layout = embedding.layout(points[:, :3], settings.gathered, settings.around)
+    near = nearest_to(queries[:, :3], points[:len(layout.around), :3], settings.neighbours)
+    return Sample(points, direct, looks, queries, asked, truth, noise, layout, near.astype(np.int32),
+                  near_mean(queries, points, looks.mean(0), 16))
 
 
 def rooms(cache: Path, split: str) -> list[Path]:
     """Those of a split, by name."""
-    out = []
-    for path in sorted(cache.glob("*.npz")):
-        with np.load(path) as found:
-            if str(found["split"]) == split:
-                out.append(path)
-    return out
+    return sorted(cache.glob(f"{split}-*.npz"))
 
 
-def turn(rng: np.random.Generator) -> NDArray[np.float64]:
-    """(3, 3) of a room about the vertical, and mirrored; half of the rooms stand along the axes, as rooms do."""
-    angle = np.pi / 2 * rng.integers(4) if rng.random() < 0.5 else rng.uniform(0, 2 * np.pi)
-    sine, cosine = np.sin(angle), np.cos(angle)
-    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]) @ np.diag([rng.choice([-1, 1]), 1, 1])
-
-
-def answer(model: nn.Module, sample: Sample, rows: NDArray, channels: list[int], matrix: NDArray
-           ) -> tuple[Tensor, Tensor]:
-    """log(1 + irradiance / level) of some queries of a room that is turned: the network's, and the truth (B, n)."""
+def answer(model: nn.Module, sample: Sample, rows: NDArray, look: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """Reflected light over the level at some queries (3, n): the network's, the truth and the guide."""
     where = loop.device()
 
     def tensor(array: NDArray) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array, np.float32)).to(where)
+        return torch.from_numpy(np.ascontiguousarray(array)).to(where)
 
-    positions, asked = sample.points[:, :3] @ matrix.T, sample.queries[rows]
-    places = embedding.normalised(positions, positions)
-    orders = [torch.from_numpy(order).to(where) for order in embedding.orders(places, len(sample.layout.around))]
-    unit = tensor(sample.level[channels]).clamp_min(1e-30)[:, None]
-    codes = model.encoder(
-        tensor(places), tensor(sample.points[:, 3:6] @ matrix.T), tensor(sample.areas),
-        tensor(sample.points[:, 6:9].T[channels]), tensor(sample.points[:, 9:].T[channels]) / unit,
-        tensor(sample.direct[channels]) / unit, Layout.of(sample.layout, where), orders)
-    found = model.decoder(
-        codes, tensor(places[:codes.shape[1]]), tensor(embedding.normalised(asked[:, :3] @ matrix.T, positions)),
-        tensor(asked[:, 3:6] @ matrix.T), tensor(asked[:, 6:].T[channels]),
-        tensor(sample.asked[channels][:, rows]) / unit,
-        torch.from_numpy(sample.near[rows].astype(np.int64)).to(where))
-    return found, (tensor(sample.irradiance[rows].T[channels]) / unit).log1p()
+    middle = sample.points[:, :3].mean(0)
+    frame = Frame.of(tensor(sample.points[:, :3] - middle), tensor(sample.points[:, 3:6]), sample.layout)
+    albedo, direct, indirect = (tensor(each.T) for each in (sample.points[:, 6:], sample.direct, sample.looks[look]))
+    unit = level(indirect, frame.areas).clamp_min(1e-30)[:, None]
+    codes = model.encoder(frame, albedo, direct / unit, indirect / unit)
+    found = model.decoder(codes, frame, tensor(sample.queries[rows, :3] - middle), tensor(sample.queries[rows, 3:6]),
+                          tensor(sample.asked[rows].T) / unit, tensor(sample.near[rows].astype(np.int64)))
+    return found, tensor(sample.truth[rows].T) / unit, tensor(sample.guide[rows].T) / unit
 
 
-def relative(found: Tensor, truth: Tensor) -> Tensor:
-    """Relative L2 of logarithms, by the mean of both; no gradient through that, as in Müller et al. 2021.
+def relative(found: Tensor, truth: Tensor, guide: Tensor) -> Tensor:
+    """Relative L2, by what was found and by the guide; no gradient through that, as in Müller et al. 2021.
 
-    Equation 12 divides by what was found. There a few points that are far too dark outweigh all others, and a training
-    at one room a step went astray.
+    Of values, not of their logarithms as equation 12: the truth is noisy, and least squares of values aim at its mean
+    as long as they are not weighted by it.
     """
-    return ((found - truth) / ((found.detach() + truth) / 2 + EPSILON)).square().mean()
+    return ((found - truth).square() / ((found.detach().square() + guide.square()) / 2 + EPSILON)).mean()
 
 
 def held_rows(sample: Sample) -> NDArray:
@@ -150,40 +117,65 @@ def held_rows(sample: Sample) -> NDArray:
 
 
 def judged(found: NDArray, sample: Sample) -> dict[str, float]:
-    """Errors of irradiance (n, 3) at `held_rows`.
+    """Errors of reflected light (n, 3) at `held_rows`, in each over what they would be of darkness.
 
-    Squared error over squared truth, of logarithms and of irradiance itself, which is mostly what is beside lamps; and
-    equation 12, which forgives what is too bright and not what is too dark, as it divides by what was found.
+    `relative` as it is trained with, without what the truth's own noise is expected to add; squared error over squared
+    truth, likewise; and that of the logarithm of 1 + light / level, with the noise.
     """
-    truth, unit = sample.irradiance[held_rows(sample)], sample.level.clip(1e-30)
+    rows, unit = held_rows(sample), sample.level.clip(1e-30)
+    truth, noise = sample.truth[rows], sample.noise[rows]
+    beyond = np.square(found - truth) - np.square(noise)
+    weight = 1 / ((np.square(found) + np.square(sample.guide[rows])) / 2 + EPSILON * unit ** 2)
     logs = [np.log1p(each / unit) for each in (found, truth)]
-    return {"log_mse": _share(*logs), "rel_mse": _share(found, truth),
-            "equation_12": float(np.square((logs[0] - logs[1]) / (logs[0] + EPSILON)).mean())}
-
-
-def _share(found: NDArray, truth: NDArray) -> float:
-    return float(np.square(found - truth).sum() / np.square(truth).sum())
+    return {"relative": float((beyond * weight).mean()), "squares": float(beyond.sum() / np.square(truth).sum()),
+            "logs": float(np.square(logs[0] - logs[1]).sum() / np.square(logs[1]).sum())}
 
 
 def network(model: nn.Module, sample: Sample) -> NDArray:
     """What it gives at `held_rows`: (n, 3)."""
     with torch.no_grad():
-        found, _ = answer(model, sample, held_rows(sample), [0, 1, 2], np.eye(3))
-    return found.expm1().T.cpu().numpy() * sample.level
+        found, *_ = answer(model, sample, held_rows(sample))
+    return found.T.cpu().numpy() * sample.level
 
 
-def unshadowed(sample: Sample) -> NDArray:
-    """(n, 3) direct light of all that shines at `held_rows`, as if nothing stood between."""
-    return sample.asked[:, held_rows(sample)].T
+def sphere(sample: Sample, rows: NDArray) -> NDArray:
+    """(n, 3) reflected light in an integrating sphere of the room's mean albedo and mean light off surfaces."""
+    share = sample.layout.areas / sample.layout.areas.sum()
+    first = share @ (sample.points[:, 6:] * sample.direct)
+    return np.tile(first / (1 - share @ sample.points[:, 6:]), (len(rows), 1))
 
 
-BASELINES = {
-    "the room's true mean": lambda sample: np.tile(sample.irradiance.mean(0), (len(held_rows(sample)), 1)),
-    "integrating sphere": lambda sample: np.tile(sample.level, (len(held_rows(sample)), 1)),
-    "direct, unshadowed": unshadowed,
-    "direct, unshadowed, and the sphere's bounces": lambda sample: (
-        unshadowed(sample) + sample.level * (sample.areas @ sample.points[:, 6:9]) / sample.areas.sum()),
-}
+def one_bounce(sample: Sample, rows: NDArray) -> NDArray:
+    """(n, 3) light off scene points, each a disc, as if nothing stood between; the sphere's for further bounces."""
+    areas, out = sample.layout.areas, []
+    for some in np.array_split(rows, -(-len(rows) // 1024)):
+        way = sample.points[None, :, :3] - sample.queries[some, None, :3]
+        square = np.square(way).sum(2)
+        here = np.einsum("nmx,nx->nm", way, sample.queries[some, 3:6]).clip(0)
+        there = -np.einsum("nmx,mx->nm", way, sample.points[:, 3:6]).clip(max=0)
+        form = here * there * areas / np.pi / (square * (square + areas / np.pi)).clip(1e-20)
+        out.append(form @ (sample.points[:, 6:] * sample.direct))
+    return np.concatenate(out) / (1 - areas @ sample.points[:, 6:] / areas.sum())
+
+
+def near_mean(queries: NDArray, points: NDArray, light: NDArray, count: int) -> NDArray[np.float32]:
+    """(N, 3) light (M, 3) of scene points, averaged over those of the `count` nearest that face as the query does."""
+    near = nearest_to(queries[:, :3], points[:, :3], count)
+    square = np.square(points[near, :3] - queries[:, None, :3]).sum(2)
+    facing = (points[near, 3:6] * queries[:, None, 3:6]).sum(2)
+    weight = np.exp(-2 * square / square.mean(1, keepdims=True).clip(1e-20)) * np.exp(4 * (facing - 1))
+    return np.einsum("nk,nkc->nc", weight / weight.sum(1, keepdims=True), light[near]).astype(np.float32)
+
+
+def nearest_points(count: int) -> Callable[[Sample, NDArray], NDArray]:
+    """`near_mean` of the first look, at some queries."""
+    return lambda sample, rows: near_mean(sample.queries[rows], sample.points, sample.looks[0], count)
+
+
+# reflected light at some queries of a room, without training
+BASELINES: dict[str, Callable[[Sample, NDArray], NDArray]] = {
+    "integrating sphere": sphere, "one bounce off scene points": one_bounce,
+    **{f"mean of the {count} nearest scene points": nearest_points(count) for count in (16, 64, 256)}}
 
 
 def train(recipe: Recipe, kept: list[Path], held: list[Sample], seed: int, checkpoint: Path, log: Path) -> Embedding:
@@ -196,8 +188,8 @@ def train(recipe: Recipe, kept: list[Path], held: list[Sample], seed: int, check
         for _ in range(recipe.rooms):
             sample = load(kept[rng.integers(len(kept))], recipe.settings)
             rows = rng.permutation(len(sample.queries))[:recipe.queries]
-            found, truth = answer(model, sample, rows, [int(rng.integers(3))], turn(rng))
-            losses.append(relative(found.float(), truth))
+            found, *known = answer(model, sample, rows, int(rng.integers(len(sample.looks))))
+            losses.append(relative(found.float(), *known))
         return torch.stack(losses).mean()
 
     def look(model: nn.Module) -> dict[str, float]:
@@ -209,19 +201,12 @@ def train(recipe: Recipe, kept: list[Path], held: list[Sample], seed: int, check
 
 
 def table(model: nn.Module, held: list[Sample]) -> str:
-    """The network beside what needs no training, and the noise of the truth."""
-    lines = [f"{'mean of the rooms, and in brackets the median':46}{'log MSE':>16}{'rel. MSE':>18}{'equation 12':>18}"]
-
-    def row(name: str, *columns: list[float]) -> str:
-        return f"{name:46}" + "".join(f"{np.mean(each):9.4f} ({np.median(each):.4f})" for each in columns)
-
-    for name, give in {"network": lambda sample: network(model, sample), **BASELINES}.items():
-        found = [judged(give(sample), sample) for sample in held]
-        lines.append(row(name, *([each[key] for each in found] for key in found[0])))
-    noisy = [(sample.irradiance[held_rows(sample)], sample.noise[held_rows(sample)], sample.level) for sample in held]
-    lines.append(row("noise of the truth", [_share(np.log1p(truth / unit) + noise / (truth + unit),
-                                                   np.log1p(truth / unit)) for truth, noise, unit in noisy],
-                     [_share(truth + noise, truth) for truth, noise, _ in noisy]))
+    """The network beside what needs no training."""
+    lines = [f"{'mean of the rooms, and in brackets the median':46}{'relative':>18}{'squares':>18}{'logarithms':>18}"]
+    for name, give in {"network": lambda sample, _: network(model, sample), **BASELINES}.items():
+        found = [judged(give(sample, held_rows(sample)), sample) for sample in held]
+        columns = [[each[key] for each in found] for key in found[0]]
+        lines.append(f"{name:46}" + "".join(f"{np.mean(each):9.4f} ({np.median(each):.4f})" for each in columns))
     return "\n".join(lines)
 
 
@@ -237,7 +222,7 @@ def main() -> None:
     torch.set_num_threads(1)  # steps are small, and a second thread that must wait loses tenfold
     recipe = RECIPES[arguments.configuration]
     if arguments.steps:
-        recipe = Recipe(recipe.settings, arguments.steps, recipe.rate, recipe.rooms, recipe.queries, recipe.every)
+        recipe = replace(recipe, steps=arguments.steps)
     kept = rooms(arguments.cache, "train")
     held = [load(path, recipe.settings) for path in rooms(arguments.cache, "validation")]
     if not kept or not held:
@@ -248,7 +233,7 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     weights.save(arguments.out / weights.EMBEDDING,
                  {name: value.cpu().numpy() for name, value in model.state_dict().items()})
-    draw(log, ["loss", "log_mse", "rel_mse"])
+    draw(log, ["loss", "relative", "squares"])
     print(f"{len(kept)} rooms, {len(held)} held out\n{table(model, held)}")
 
 

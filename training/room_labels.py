@@ -2,8 +2,10 @@
 """Rooms with the light in them, to train on, made once and kept: `python -m training.room_labels --rooms 200`.
 
 One .npz a room (see `label`) in training/cache/rooms/, which git ignores. A run that was stopped goes on where it
-was; a file made with other settings, or by another version of the generator, has another name. Rooms to train on have
-fewer rays than those to validate with: their noise is as good as more rooms are useful, and it is written beside them.
+was; a file made with other settings, or by another version of the generator, has another name. Light straight from
+emitters and light that was reflected are apart: the former has hardly any noise, so the paths are spent on the latter.
+Rooms to train on have fewer than those to validate with: their noise is as good as more rooms are useful, and it is
+written beside them.
 """
 from __future__ import annotations
 
@@ -24,27 +26,32 @@ from tqdm import tqdm
 from neural_gash_addon.backend import irradiance, methods, sampling
 from neural_gash_addon.backend.errors import UserError
 from neural_gash_addon.backend.exchange import write_npz
+from neural_gash_addon.backend.lit_points import POINTS, REFLECTED, lit_points
 from neural_gash_addon.backend.lit_scene import LitScene
 from neural_gash_addon.backend.raycast import Occluders
-from neural_gash_addon.backend.scene_points import scene_points
 
 from . import data, rooms
 
-VERSION = 1            # raised whenever the same job gives other labels
+VERSION = 2            # raised whenever the same job gives other labels
 CACHE = data.CACHE / "rooms"
 TRAIN, VALIDATION, EVALUATION = "train", "validation", "evaluation"
-TRAIN_RAYS, VALIDATION_RAYS = 512, irradiance.RAYS
-POINTS, QUERIES = 4096, 4096
-KEYS = ("scene_points", "queries", "irradiance", "noise", "seed", "split")
+TRAIN_RAYS, VALIDATION_RAYS = 512, 2048  # for reflected light
+DIRECT_RAYS = 256      # for light straight from emitters
+QUERIES = 2048
+LOOKS = 4              # independent ones at the light of the scene points, so that their noise is not learned by heart
+KEYS = ("scene_points", "point_direct", "point_indirect", "queries", "direct", "direct_noise", "indirect",
+        "indirect_noise", "seed", "split")
 _FIRST = {TRAIN: 0, VALIDATION: 1_000_000, EVALUATION: 2_000_000}  # seeds: no room is in two of them
-_SIGHT = 0.02          # metres that a visible point sees, at least, in some of LOOKS directions
-_LOOKS = 16
+CORNELL = -1           # instead of a seed
+_SCENES = 2_900_000    # number of the first scene of a file, likewise
+_SIGHT = 0.02          # metres that a visible point sees, at least, in some of _WAYS directions
+_WAYS = 16
 _SEEING = 2            # of them at least: one in a slit may just graze along it
 
 
 @dataclass(frozen=True)
 class Job:
-    """A room to label: of a seed; of the split EVALUATION, a scene in a file or else the Cornell box."""
+    """A room to label: of a seed, the Cornell box or a scene in a file."""
 
     seed: int
     split: str
@@ -76,18 +83,19 @@ def jobs(count: int, split: str, rays: int, points: int = POINTS, queries: int =
     return [Job(seed, split, rays, points, queries, tuple(files)) for seed in range(first, first + count)]
 
 
-def evaluation(folder: Path | None, rays: int, points: int = POINTS, queries: int = QUERIES) -> list[Job]:
-    """The Cornell box, and the scenes of a folder, see `rooms.read`."""
-    sources = [None, *(sorted(folder.glob("*.npz")) if folder else [])]
-    return [Job(_FIRST[EVALUATION] + number, EVALUATION, rays, points, queries, source=source)
-            for number, source in enumerate(sources)]
+def evaluation(count: int, folder: Path | None, rays: int, points: int = POINTS, queries: int = QUERIES) -> list[Job]:
+    """The Cornell box, the first rooms of the split, and the scenes of a folder, see `rooms.read`."""
+    sources = sorted(folder.glob("*.npz")) if folder else []
+    return [Job(CORNELL, EVALUATION, rays, points, queries), *jobs(count, EVALUATION, rays, points, queries),
+            *(Job(_SCENES + number, EVALUATION, rays, points, queries, source=source)
+              for number, source in enumerate(sources))]
 
 
 def scene_of(job: Job) -> LitScene:
     """The scene of a job. Raises UserError where a file holds none."""
     if job.source is not None:
         return rooms.read(job.source)
-    return rooms.cornell_box() if job.split == EVALUATION else rooms.generate(job.seed, job.files)
+    return rooms.cornell_box() if job.seed == CORNELL else rooms.generate(job.seed, job.files)
 
 
 def visible_points(scene: LitScene, count: int, seed: int, occluders: Occluders) -> NDArray[np.float32]:
@@ -104,15 +112,15 @@ def visible_points(scene: LitScene, count: int, seed: int, occluders: Occluders)
         corners = scene.corners[faces]
         points = (corners * np.stack([1 - u - v, u, v], 1)[:, :, None]).sum(1)
         normals = scene.normals[faces]
-        local = sampling.hemisphere_sets(1, _LOOKS, seed)[0]
+        local = sampling.hemisphere_sets(1, _WAYS, seed)[0]
         frames = sampling.frames(normals, rng.uniform(0, 2 * np.pi, count))
         ways = np.einsum("nij,rj->nri", frames, local).astype(np.float32).reshape(-1, 3)
-        origins = occluders.origins(points, normals).repeat(_LOOKS, axis=0)
+        origins = occluders.origins(points, normals).repeat(_WAYS, axis=0)
         near = occluders.blocked(origins, ways, np.full(len(ways), _SIGHT * occluders.scale, np.float32)) == 0
         hits = occluders.hits(origins, ways)
         met = np.zeros(len(ways), bool)
         met[hits.rays[hits.front]] = True
-        seen = (met & ~near).reshape(count, _LOOKS).sum(1) >= _SEEING
+        seen = (met & ~near).reshape(count, _WAYS).sum(1) >= _SEEING
         found.append(np.concatenate([points, normals, scene.albedo_at(faces, u, v)], 1)[seen].astype(np.float32))
         total += len(found[-1])
         if total >= count:
@@ -122,19 +130,31 @@ def visible_points(scene: LitScene, count: int, seed: int, occluders: Occluders)
 
 def label(scene: LitScene, *, seed: int, split: str, rays: int, points: int = POINTS, queries: int = QUERIES,
           threads: int | None = 1) -> dict[str, NDArray]:
-    """A scene as the network wants it, by KEYS. Metres, linear RGB.
+    """A scene as the network wants it, by KEYS. Metres, linear RGB, W/m^2.
 
     Returns:
-        scene_points (M, 12) position, unit normal, albedo, emission, so ordered that its first points are a good
-        sample too; queries (N, 9) position, unit normal, albedo; irradiance (N, 3) W/m^2 and noise (N, 3), its
-        standard error; seed; split. All float32.
+        scene_points (M, 9) position, unit normal, albedo, so ordered that its first points are a good sample too, and
+        the light there as `lit_points` has it: point_direct (M, 3), point_indirect (LOOKS, M, 3); queries (N, 9) as
+        scene_points; direct, indirect (N, 3) irradiance straight from emitters and reflected, and direct_noise,
+        indirect_noise (N, 3), their standard errors; seed; split. All float32.
     """
-    occluders = scene.occluders()
-    asked = visible_points(scene, queries, seed, occluders)
-    found = methods.run(irradiance.irradiance(scene, asked[:, :3], asked[:, 3:6], rays, seed=seed, threads=threads,
-                                              occluders=occluders))
-    return {"scene_points": scene_points(scene, points, seed), "queries": asked, "irradiance": found.values,
-            "noise": found.error, "seed": np.array(seed), "split": np.array(split)}
+    number, occluders = abs(seed), scene.occluders()
+    asked = visible_points(scene, queries, number, occluders)
+
+    def traced(at: NDArray, normals: NDArray, paths: int, straight: bool, look: int) -> irradiance.Irradiance:
+        return methods.run(irradiance.irradiance(
+            scene, at, normals, paths, depth=1 if straight else irradiance.DEPTH, straight=straight,
+            seed=number + look * 10_000_000, threads=threads, occluders=occluders))
+
+    lit = methods.run(lit_points(scene, occluders, points, seed=number, threads=threads))
+    looks = [lit.indirect, *(traced(lit.places, lit.normals, REFLECTED, False, look).values
+                             for look in range(1, LOOKS))]
+    direct = traced(asked[:, :3], asked[:, 3:6], DIRECT_RAYS, True, LOOKS)
+    indirect = traced(asked[:, :3], asked[:, 3:6], rays, False, LOOKS)
+    return {"scene_points": np.concatenate([lit.places, lit.normals, lit.albedo], 1), "point_direct": lit.direct,
+            "point_indirect": np.stack(looks), "queries": asked, "direct": direct.values, "direct_noise": direct.error,
+            "indirect": indirect.values, "indirect_noise": indirect.error, "seed": np.array(seed),
+            "split": np.array(split)}
 
 
 def work(job: Job, path: Path) -> Outcome:
@@ -181,6 +201,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m training.room_labels", description=__doc__)
     parser.add_argument("--rooms", type=int, default=200, help="to train on")
     parser.add_argument("--validation", type=int, default=16, help="rooms to validate with")
+    parser.add_argument("--evaluation", type=int, default=8, help="rooms to evaluate with, beside the Cornell box")
     parser.add_argument("--rays", type=int, default=TRAIN_RAYS, help="from each point of a room to train on")
     parser.add_argument("--validation-rays", type=int, default=VALIDATION_RAYS)
     parser.add_argument("--points", type=int, default=POINTS, help="scene points of a room")
@@ -193,7 +214,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     files = sorted(p for p in options.meshes.glob("*") if p.suffix in data.SUFFIXES) if options.meshes else []
     wanted = [*jobs(options.rooms, TRAIN, options.rays, options.points, options.queries, files),
               *jobs(options.validation, VALIDATION, options.validation_rays, options.points, options.queries, files),
-              *evaluation(options.scenes, options.validation_rays, options.points, options.queries)]
+              *evaluation(options.evaluation, options.scenes, options.validation_rays, options.points, options.queries)]
     paths, done = prepare(wanted, options.cache, options.workers)
     if done:
         seconds = sum(outcome.seconds for outcome in done)

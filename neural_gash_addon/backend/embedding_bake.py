@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Irradiance in a room by the light-transport embedding: encode the room once, then ask for any points. Needs torch."""
+"""Irradiance in a room by the light-transport embedding: encode the room once, then ask for any points. Needs torch.
+
+Light straight from emitters is path traced at each point, where it has little noise. What was reflected is traced at
+scene points alone, with few paths, and the network says from them what it is anywhere.
+"""
 from __future__ import annotations
 
 from collections.abc import Generator
@@ -9,17 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import embedding, weights
+from . import irradiance as tracing
 from .errors import UserError
+from .geometry import NOT_FINITE
+from .irradiance import Irradiance
+from .lit_points import STRAIGHT, LitPoints, lit_points
+from .lit_scene import LitScene
 from .nearest import nearest_to
 from .paper_bake import import_torch
+from .progress import scaled
+from .raycast import Occluders
 
-QUERIES_AT_ONCE = 4096  # decoded together, so that memory does not grow with their number
+QUERIES_AT_ONCE = 4096          # decoded together, so that memory does not grow with their number
+CHECKED, CHECKS = 128, 1024     # points whose reflected light is traced as well, to know the error; paths of each
 
 
 def network() -> Any:
     """The trained network: networks.embedding.Embedding, on the GPU where there is one, in `eval` mode.
-
-    None ships yet (docs/embedding.md says why); `python -m training.embedding` writes one.
 
     Raises:
         UserError: no torch, or no weights, or not those that were trained.
@@ -33,74 +43,112 @@ def network() -> Any:
     return model.to("cuda" if torch.cuda.is_available() else "cpu").eval()
 
 
+def irradiance(scene: LitScene, points: NDArray, normals: NDArray, *, seed: int = 0, threads: int | None = None,
+         occluders: Occluders | None = None) -> Generator[float, None, Irradiance]:
+    """Light that arrives at points, as `irradiance.irradiance` gives it: direct light traced, reflected light learned.
+
+    Args:
+        points: (N, 3) metres. normals: (N, 3) unit; where it is zero, the irradiance is.
+        occluders: `scene.occluders()`, if it is there already.
+    Returns:
+        `error` is that of direct light, by its paths, and of reflected light, by how far off the network is at CHECKED
+        of the points: one share of all values.
+    Raises:
+        UserError: no torch or weights, points that are not finite, or a room larger than the network knows.
+    """
+    points, normals = np.asarray(points, np.float64), np.asarray(normals, np.float64)
+    if not (np.isfinite(points).all() and np.isfinite(normals).all()):
+        raise UserError(NOT_FINITE)
+    if not len(scene.emitters):
+        values, error = np.zeros((2, len(points), 3), np.float32)
+        return Irradiance(values, error, tracing.DARK)
+    refuse_larger(scene.positions[scene.triangles])
+    model = network()
+    occluders = occluders or scene.occluders()
+
+    def traced(rows: NDArray, rays: int, straight: bool, start: float, share: float
+               ) -> Generator[float, None, Irradiance]:
+        return (yield from scaled(tracing.irradiance(
+            scene, points[rows], normals[rows], rays, depth=1 if straight else tracing.DEPTH, straight=straight,
+            seed=seed + 1, threads=threads, occluders=occluders), start, share))
+
+    direct = yield from traced(np.arange(len(points)), STRAIGHT, True, 0.0, 0.3)
+    lit = yield from scaled(lit_points(scene, occluders, seed=seed, threads=threads), 0.3, 0.3)
+    if not len(lit.places):
+        return direct
+    room = Room(model, lit)
+    found = yield from scaled(room.reflected(points, normals, direct.values), 0.6, 0.3)
+    facing = np.flatnonzero(normals.any(1))
+    checked = np.random.default_rng([seed, 11]).permutation(facing)[:CHECKED]
+    truth = yield from traced(checked, CHECKS, False, 0.9, 0.1)
+    error = np.hypot(direct.error, _share_off(found[checked], truth) * found).astype(np.float32)
+    return Irradiance(direct.values + found, error)
+
+
+def _share_off(found: NDArray, truth: Irradiance) -> float:
+    """Relative error of values (n, 3) by a noisy truth: what its noise does not explain, and a standard error more."""
+    energy = float(np.square(found).sum())
+    if not energy or not len(found):
+        return 0.0
+    beyond = (np.square(found - truth.values) - np.square(truth.error)).sum(1)
+    return float(max(beyond.sum(), 0.0) + len(beyond) ** 0.5 * beyond.std()) ** 0.5 / energy ** 0.5
+
+
+def refuse_larger(places: NDArray) -> None:
+    """Raises UserError where a room of places (..., 3) is larger than any that the network knows."""
+    size = float(np.ptp(places.reshape(-1, 3), axis=0).max())
+    if size > embedding.EXTENT:
+        raise UserError(f"The room is {size:.1f} m long, and the network knows rooms of up to "
+                        f"{embedding.EXTENT:.0f} m; bake it in parts, or choose another method.")
+
+
 class Room:
     """A room's codes, which answer for any point."""
 
-    def __init__(self, model: Any, points: NDArray) -> None:
-        """Encode scene points.
+    def __init__(self, model: Any, points: LitPoints) -> None:
+        """Encode at least one point.
 
         Args:
             model: networks.embedding.Embedding, on its device, in `eval` mode.
-            points: (M, 12) position (metres), unit normal, albedo, emitted radiance (linear RGB), in farthest-point
-                order.
-        Raises:
-            UserError: there are no points, or the room is larger than any that the network knows.
         """
         import torch
 
-        from .networks.embedding import Layout, level, shining
+        from .networks.embedding import Frame, level
 
-        if not len(points):
-            raise UserError("There is no surface in the room; add one, or choose another method.")
-        size = float(np.ptp(points[:, :3], axis=0).max())
-        if size > embedding.EXTENT:
-            raise UserError(f"The room is {size:.1f} m long, and the network knows rooms of up to "
-                            f"{embedding.EXTENT:.0f} m; bake it in parts, or choose another method.")
-        self.model, self.positions = model, np.asarray(points[:, :3], np.float64)
-        sizes, self._where = model.settings, next(model.parameters()).device
-        stages = len(sizes.depths)
-        albedo, emission = self._tensor(points[:, 6:9].T), self._tensor(points[:, 9:12].T)
-        areas = self._tensor(embedding.areas(self.positions))
-        self.level = level(albedo, emission, areas)  # (3,); zero where nothing shines, and all is dark
-        places = embedding.normalised(self.positions, self.positions)
-        known = Layout.of(embedding.layout(self.positions, stages, sizes.gathered, sizes.around), self._where)
-        orders = [torch.from_numpy(order).to(self._where) for order in embedding.orders(places, stages)]
-        emission = emission / self.level.clamp_min(1e-30)[:, None]
-        normals = self._tensor(points[:, 3:6])
-        rows, lamp_areas = shining(emission, areas)
-        self.lamps = (self._tensor(places)[rows] * embedding.EXTENT, normals[rows], lamp_areas, emission[:, rows])
+        self.model, self._where = model, next(model.parameters()).device
+        sizes = model.settings
+        self._centre = np.mean(points.places, axis=0, dtype=np.float64)
+        self._layout = embedding.layout(points.places, sizes.gathered, sizes.around)
+        self._frame = Frame.of(self._tensor(points.places - self._centre), self._tensor(points.normals), self._layout)
+        self._anchors = points.places[:len(self._layout.around)]
+        albedo, direct, indirect = (self._tensor(each.T) for each in (points.albedo, points.direct, points.indirect))
+        self.level = level(indirect, self._frame.areas)  # (3,); zero where nothing was reflected
+        unit = self.level.clamp_min(1e-30)[:, None]
         with torch.no_grad():
-            self.codes = model.encoder(self._tensor(places), normals, areas, albedo, emission,
-                                       self._direct(places, points[:, 3:6]), known, orders)
-        self.places = self._tensor(places[:self.codes.shape[1]])
+            self.codes = model.encoder(self._frame, albedo, direct / unit, indirect / unit)
 
-    def irradiance(self, queries: NDArray) -> Generator[float, None, NDArray[np.float32]]:
-        """(N, 3) irradiance, linear RGB, of queries (N, 9): position, unit normal, albedo. Yields progress."""
+    def reflected(self, points: NDArray, normals: NDArray, direct: NDArray
+                  ) -> Generator[float, None, NDArray[np.float32]]:
+        """(N, 3) reflected light at points.
+
+        Args:
+            points: (N, 3) metres. normals: (N, 3) unit; where it is zero, so is the light.
+            direct: (N, 3) light straight from emitters.
+        """
         import torch
 
-        out = np.empty((len(queries), 3), np.float32)
-        count = self.codes.shape[1]
-        for start in range(0, len(queries), QUERIES_AT_ONCE):
-            part = queries[start:start + QUERIES_AT_ONCE]
-            near = nearest_to(part[:, :3], self.positions[:count], self.model.settings.neighbours)
-            places = embedding.normalised(part[:, :3], self.positions)
+        out, unit = np.zeros((len(points), 3), np.float32), self.level[:, None]
+        for start in range(0, len(points), QUERIES_AT_ONCE):
+            rows = slice(start, start + QUERIES_AT_ONCE)
+            near = torch.from_numpy(nearest_to(points[rows], self._anchors, self.model.settings.neighbours))
             with torch.no_grad():
-                found = self.model.decoder(self.codes, self.places, self._tensor(places), self._tensor(part[:, 3:6]),
-                                           self._tensor(part[:, 6:9].T), self._direct(places, part[:, 3:6]),
-                                           torch.from_numpy(near).to(self._where))
-                out[start:start + len(part)] = (found.expm1() * self.level[:, None]).T.cpu().numpy()
-            yield min((start + len(part)) / len(queries), 1.0)
+                found = self.model.decoder(self.codes, self._frame, self._tensor(points[rows] - self._centre),
+                                           self._tensor(normals[rows]),
+                                           self._tensor(direct[rows].T) / unit.clamp_min(1e-30), near.to(self._where))
+                out[rows] = (found * unit).T.cpu().numpy()
+            yield min(rows.stop / len(points), 1.0)
+        out[~np.any(normals, axis=1)] = 0
         return out
-
-    def _direct(self, places: NDArray, normals: NDArray) -> Any:
-        """(3, n) unshadowed light of the lamps at normalised places, in units of the level."""
-        import torch
-
-        from .networks.embedding import direct
-
-        return torch.cat([direct(self._tensor(places[at:at + QUERIES_AT_ONCE]) * embedding.EXTENT,
-                                 self._tensor(normals[at:at + QUERIES_AT_ONCE]), *self.lamps)
-                          for at in range(0, len(places), QUERIES_AT_ONCE)], 1)
 
     def _tensor(self, array: NDArray) -> Any:
         import torch

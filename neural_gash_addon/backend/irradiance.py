@@ -46,13 +46,14 @@ class Irradiance:
 
 
 def irradiance(scene: LitScene, points: NDArray, normals: NDArray, rays: int = RAYS, *, depth: int = DEPTH,
-               seed: int = 0, threads: int | None = None, occluders: Occluders | None = None,
+               straight: bool = True, seed: int = 0, threads: int | None = None, occluders: Occluders | None = None,
                clearance: NDArray | None = None) -> Generator[float, None, Irradiance]:
     """Light that arrives at points from all emitters, direct and reflected up to depth - 1 times.
 
     Args:
         points: (N, 3) metres. normals: (N, 3) unit; where it is zero, the irradiance is.
         rays: paths from each point, at least BATCHES; made a multiple of it.
+        straight: whether what comes straight from emitters counts, or only what was reflected.
         occluders: `scene.occluders()`, if it is there already.
         clearance: (N, 3) from points to where their rays start (see TriangleMesh); along the normals where not given.
     Yields:
@@ -69,7 +70,7 @@ def irradiance(scene: LitScene, points: NDArray, normals: NDArray, rays: int = R
     values, error = np.zeros((2, len(points), 3), np.float32)
     if not len(scene.emitters):
         return Irradiance(values, error, DARK)
-    tracer = _Tracer(scene, occluders or scene.occluders(), -(-rays // BATCHES), depth, seed)
+    tracer = _Tracer(scene, occluders or scene.occluders(), -(-rays // BATCHES), depth, straight, seed)
     lit = np.flatnonzero(np.any(normals != 0, axis=1))
     step = max(1, _PATHS_AT_ONCE // (BATCHES * tracer.paths))
     jobs = [lit[start:start + step] for start in range(0, len(lit), step)]
@@ -89,9 +90,10 @@ def irradiance(scene: LitScene, points: NDArray, normals: NDArray, rays: int = R
 class _Tracer:
     """The scene as tables of float32 that waves of paths look up."""
 
-    def __init__(self, scene: LitScene, occluders: Occluders, paths: int, depth: int, seed: int) -> None:
+    def __init__(self, scene: LitScene, occluders: Occluders, paths: int, depth: int, straight: bool, seed: int
+                 ) -> None:
         """paths: of a batch, from each point."""
-        self.paths, self._depth = paths, depth
+        self.paths, self._depth, self._straight = paths, depth, straight
         self._scene, self._occluders = scene, occluders
         self._offset = np.float32(occluders.offset)
         corners = ((scene.corners - occluders.centre) * occluders.scale).transpose(1, 2, 0)  # (corner, axis, F)
@@ -132,12 +134,15 @@ class _Tracer:
                 break
             towards, around = ((self._net(rng, n // self.paths) for _ in range(2)) if vertex == 0
                                else rng.random((2, 2, n), np.float32))
-            self._gather_emitters(gathered, path, carried, origins, up, towards)
+            counts = vertex > 0 or self._straight
+            if counts:
+                self._gather_emitters(gathered, path, carried, origins, up, towards)
             radius, angle = np.sqrt(around[0]), around[1] * np.float32(2 * np.pi)
             cosine = np.sqrt(1 - around[0])
             directions = tangents * (radius * np.cos(angle)) + bitangents * (radius * np.sin(angle)) + up * cosine
             faces, u, v, _ = self._occluders.first(_rows(origins), _rows(directions))
-            self._gather_met(gathered, path, carried, origins, directions, cosine, faces, u, v)
+            if counts:
+                self._gather_met(gathered, path, carried, origins, directions, cosine, faces, u, v)
             if vertex == self._depth - 1:
                 break
             # roulette by what is carried on the average of the triangle, so that few textures are looked up

@@ -146,6 +146,17 @@ def test_it_equals_a_slow_twin(point, normal):
     assert noise.max() < 0.1 * expected.max()
 
 
+def test_straight_and_reflected_light_are_all_light():
+    scene = textured_box()
+    points, normals = [[-0.3, -0.2, -0.5], [0.2, 0.1, -0.19]], np.repeat(UP, 2, 0)
+    whole = run(scene, points, normals, 8192)
+    straight, reflected = run(scene, points, normals, 8192, depth=1), run(scene, points, normals, 8192, straight=False)
+    off = straight.values + reflected.values - whole.values
+    assert (np.abs(off) < 4 * np.sqrt(straight.error ** 2 + reflected.error ** 2 + whole.error ** 2)).all()
+    assert reflected.values.min() > 0.1 and straight.values.min() > 0.1
+    assert not run(scene, points, normals, depth=1, straight=False).values.any()
+
+
 def test_light_from_the_back_only_where_it_is_to_be():
     floor, light = quad((-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)), ceiling(0.5, 1.0)
     above = [[0, 0, 2.0]], [[0, 0, -1.0]]

@@ -23,21 +23,25 @@ def test_a_file_holds_what_it_promises(tmp_path):
     assert len(paths) == len(done) == 3 and not any(o.problem for o in done)
     for job, path in zip(jobs, paths, strict=True):
         found = load(path)
-        assert [found.pop(key).shape for key in room_labels.KEYS] == [(64, 12), (48, 9), (48, 3), (48, 3), (), ()]
+        assert [found.pop(key).shape for key in room_labels.KEYS] == [
+            (64, 9), (64, 3), (room_labels.LOOKS, 64, 3), (48, 9), *[(48, 3)] * 4, (), ()]
         assert not found
         found = load(path)
-        assert all(found[key].dtype == np.float32 and np.isfinite(found[key]).all() for key in room_labels.KEYS[:4])
+        assert all(found[key].dtype == np.float32 and np.isfinite(found[key]).all() for key in room_labels.KEYS[:8])
         assert found["seed"] == job.seed and str(found["split"]) == job.split
-        assert found["irradiance"].max() > 0 and (found["noise"] >= 0).all()
+        assert found["direct"].max() > 0 and found["indirect"].max() > 0 and (found["indirect_noise"] >= 0).all()
         for points in (found["scene_points"], found["queries"]):
             assert np.linalg.norm(points[:, 3:6], axis=1) == pytest.approx(1, abs=1e-5)
             assert points[:, 6:9].min() >= 0 and points[:, 6:9].max() <= 1
-        # a second, independent look with more rays
+        # a second, independent look with more rays, at both together
         scene = rooms.generate(job.seed)
         asked = found["queries"]
         truth = methods.run(irradiance.irradiance(scene, asked[:, :3], asked[:, 3:6], 4096, seed=77))
-        score = (found["irradiance"] - truth.values) / np.maximum(np.hypot(found["noise"], truth.error), 1e-6)
+        noise = np.sqrt(found["direct_noise"] ** 2 + found["indirect_noise"] ** 2 + truth.error ** 2)
+        score = (found["direct"] + found["indirect"] - truth.values) / np.maximum(noise, 1e-6)
         assert np.median(np.abs(score)) < 1.2 and (np.abs(score) < 6).mean() > 0.97
+        looks = found["point_indirect"]
+        assert np.ptp(looks, axis=0).max() > 0 and np.allclose(looks.mean(1), looks.mean((0, 1)), rtol=2)
     assert load(paths[0])["seed"] != load(paths[2])["seed"]
 
 
@@ -87,22 +91,24 @@ def test_points_that_nobody_sees_are_not_asked():
 
 def test_the_command(tmp_path, capsys):
     assert room_labels.main(["--rooms", "1", "--validation", "1", "--rays", "16", "--validation-rays", "16", "--points",
-                             "32", "--queries", "16", "--cache", str(tmp_path), "--workers", "0"]) == 0
-    assert "3 of 3" in capsys.readouterr().out
+                             "32", "--queries", "16", "--evaluation", "1", "--cache", str(tmp_path), "--workers", "0"
+                             ]) == 0
+    assert "4 of 4" in capsys.readouterr().out
     found = [load(path) for path in sorted(tmp_path.glob("*.npz"))]
-    assert sorted(str(each["split"]) for each in found) == ["evaluation", "train", "validation"]
+    assert sorted(str(each["split"]) for each in found) == ["evaluation", "evaluation", "train", "validation"]
 
 
 def test_scenes_of_files_are_labelled(meshes):
-    jobs = room_labels.evaluation(meshes / "scenes", 64, 512, 256)
+    jobs = room_labels.evaluation(0, meshes / "scenes", 64, 512, 256)
     assert len(jobs) == 4
     for job in jobs:
         scene = room_labels.scene_of(job)
         assert np.ptp(scene.positions, axis=0).max() < floor_plans.LARGEST
         found = room_labels.label(scene, seed=job.seed, split=job.split, rays=job.rays, points=job.points,
                                   queries=job.queries)
-        assert found["queries"].shape == (256, 9) and np.isfinite(found["irradiance"]).all()
-        assert (found["irradiance"].max(1) > 0).mean() > 0.5, job  # lit, and asked on the sides that light reaches
+        assert found["queries"].shape == (256, 9) and np.isfinite(found["indirect"]).all()
+        lit = (found["direct"] + found["indirect"]).max(1) > 0
+        assert lit.mean() > 0.5, job  # asked on the sides that light reaches
     ours, theirs = (room_labels.scene_of(job) for job in jobs[:2])
     points = np.array([[0.45, 0.3, 0], [0.1, 0.2, 0], [0.001, 0.3, 0.2], [0.28, 0.5592, 0.5]])
     normals = np.array([[0, 0, 1], [0, 0, 1], [1, 0, 0], [0, -1, 0]])
