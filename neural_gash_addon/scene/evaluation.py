@@ -48,6 +48,13 @@ def revealed(objects: Iterable[bpy.types.Object], depsgraph: bpy.types.Depsgraph
         bpy.data.scenes.remove(scene)
 
 
+def scene_objects(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> list[bpy.types.Object]:
+    """The objects of a scene, then those of which it has instances alone, as of a collection that is not in it."""
+    found = dict.fromkeys(scene.objects)
+    found.update(dict.fromkeys(one.original for one in depsgraph.ids if isinstance(one, bpy.types.Object)))
+    return list(found)
+
+
 def shown_objects(layer: bpy.types.ViewLayer) -> set[int]:
     """Session uids of the objects that the viewport shows and a render of this view layer would.
 

@@ -16,7 +16,7 @@ from .read import same_fingerprint
 _files: dict[str, tuple[float, Sequence]] = {}  # path -> when the file was written, and the file
 
 
-def show_frame(scene: bpy.types.Scene, obj: bpy.types.Object) -> bool:
+def show_frame(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
     """Write the current frame of an object's sequence to it, the nearest beyond its ends; False if it is there already.
 
     Raises:
@@ -31,7 +31,7 @@ def show_frame(scene: bpy.types.Scene, obj: bpy.types.Object) -> bool:
     write_transfer(obj, sequence.elements, Transfer(coefficients, record))
     obj.data[SEQUENCE] = name
     if record.frame != before.frame or record.colours != before.colours:
-        light_object(scene, obj)
+        light_object(scene, obj, depsgraph)
     return True
 
 
