@@ -330,8 +330,15 @@ def _on_rendered(*_: object) -> None:
         bpy.app.timers.register(renders.show_all)  # renders of a window end in a thread of their own
 
 
+@persistent
+def _on_save(*_: object) -> None:
+    """A file saved in the midst of a render has all its previews; the next frame looks again."""
+    renders.show_all()
+
+
 _HANDLERS = (("depsgraph_update_post", _on_update), ("frame_change_post", _on_frame), ("load_post", _on_load),
-             ("render_init", _on_render), ("render_complete", _on_rendered), ("render_cancel", _on_rendered))
+             ("save_pre", _on_save), ("render_init", _on_render), ("render_complete", _on_rendered),
+             ("render_cancel", _on_rendered))
 
 
 def register() -> None:

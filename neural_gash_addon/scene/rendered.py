@@ -28,17 +28,19 @@ def show_what_fits(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, probl
         problems: why objects could not be followed, by their session uids.
     """
     for obj in scene_objects(scene, depsgraph):
-        if (not has_bake(obj) or obj.evaluated_get(depsgraph).hide_render or obj.library or obj.data.is_editmode
+        if (not has_bake(obj) or obj.evaluated_get(depsgraph).hide_render or obj.data.is_editmode
                 or not (scene.neural_gash.live or SEQUENCE in obj.data)
                 or not (is_on(obj) or obj.session_uid in _aside)):
             continue
         if fits(obj, depsgraph):
             _show(scene, obj, depsgraph)
-        elif is_on(obj):
-            _LOGGER.warning("Frame %d: the bake of '%s' does not fit, so its own materials are rendered. %s",
-                            scene.frame_current, obj.name, problems.get(obj.session_uid, ""))
+        elif is_on(obj) and obj.session_uid not in _aside:
+            _LOGGER.warning("Frame %d: the bake of '%s' does not fit, so %s. %s", scene.frame_current, obj.name,
+                            "its shadows are wrong" if obj.library else "its own materials are rendered",
+                            problems.get(obj.session_uid, ""))
             _aside[obj.session_uid] = scene.name
-            preview_off(obj)
+            if not obj.library:  # whose slots cannot be changed
+                preview_off(obj)
 
 
 def show_all() -> None:
@@ -62,6 +64,8 @@ def _show(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types.De
     if obj.session_uid not in _aside:
         return
     del _aside[obj.session_uid]
+    if is_on(obj):
+        return
     try:
         preview_on(obj, scene.neural_gash.lobe_shown())
     except UserError as error:

@@ -274,6 +274,26 @@ def test_where_it_cannot_follow_own_materials_are_rendered(wing, settings, tmp_p
         assert np.allclose(picture, plain, atol=2e-3) == (frame >= first)
 
 
+def test_saved_in_the_midst_of_a_render(wing, settings, tmp_path, eye):
+    """The file has the preview, and the frames after it are still the object's own."""
+    settings.live, settings.target, settings.side = True, "TEXTURE", 32
+    bpy.ops.neural_gash.bake()
+    plain = eye.moving()
+    saved = str(tmp_path / "saved.blend")
+
+    def save(*_):
+        bpy.ops.wm.save_as_mainfile(filepath=saved, copy=True)
+    bpy.app.handlers.render_post.append(save)
+    try:
+        moving = eye.moving()
+    finally:
+        bpy.app.handlers.render_post.remove(save)
+    np.testing.assert_allclose(moving, plain, atol=2e-3)
+    assert preview.is_on(wing)
+    bpy.ops.wm.open_mainfile(filepath=saved)
+    assert preview.is_on(bpy.data.objects["Wing"]) and not rendered._aside
+
+
 def test_a_stale_bake_that_nothing_follows_is_rendered_as_it_is(wing, settings, eye, caplog):
     with caplog.at_level(logging.WARNING):
         moving = eye.moving()
