@@ -55,17 +55,18 @@ def scene_objects(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> lis
     return list(found)
 
 
-def shown_objects(layer: bpy.types.ViewLayer) -> set[int]:
-    """Session uids of the objects that the viewport shows and a render of this view layer would.
+def shown_objects(depsgraph: bpy.types.Depsgraph) -> set[int]:
+    """Session uids of the objects that the viewport shows and a render of the depsgraph's view layer would.
 
-    The dependency graph lists objects of hidden collections too.
+    The dependency graph lists objects of hidden collections too; but what is animated is in a render right there only.
     """
+    layer = depsgraph.view_layer
     rendered: set[int] = set()
     front = [layer.layer_collection]
     while front:
         place = front.pop()
         if place.exclude or place.collection.hide_render:
             continue
-        rendered |= {o.session_uid for o in place.collection.objects if not o.hide_render}
+        rendered |= {o.session_uid for o in place.collection.objects if not o.evaluated_get(depsgraph).hide_render}
         front += place.children
     return {o.session_uid for o in layer.objects if o.session_uid in rendered and o.visible_get(view_layer=layer)}

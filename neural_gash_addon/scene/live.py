@@ -287,7 +287,7 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
                if isinstance(update.id, bpy.types.Object)
                and (update.is_updated_geometry or update.is_updated_transform)}
     if any(isinstance(update.id, (bpy.types.Scene, bpy.types.Collection)) for update in depsgraph.updates):
-        shown = frozenset(shown_objects(depsgraph.view_layer))  # what is hidden or removed is itself no update
+        shown = frozenset(shown_objects(depsgraph))  # what is hidden or removed is itself no update
         changed |= _shown.get(scene.session_uid, frozenset()) ^ shown
         _shown[scene.session_uid] = shown
     if changed:

@@ -317,7 +317,7 @@ def _instances(depsgraph: bpy.types.Depsgraph, owners: set[int] | None, baked: b
     `baked` itself is left out, but instances of it elsewhere are not.
     """
     known: dict[tuple[int, int], tuple[NDArray, NDArray, Finish] | None] = {}
-    shown = shown_objects(depsgraph.view_layer) if owners is None else set()
+    shown = shown_objects(depsgraph) if owners is None else set()
     for instance in depsgraph.object_instances:
         solid = instance.object
         if solid.type != "MESH" or not instance.show_self:  # curves, texts and balls come as meshes too
@@ -325,7 +325,7 @@ def _instances(depsgraph: bpy.types.Depsgraph, owners: set[int] | None, baked: b
         owner = (instance.parent if instance.is_instance else solid).original
         if owner == baked and not instance.is_instance:
             continue
-        if owners is None and (owner.session_uid not in shown or solid.original.hide_render):
+        if owners is None and (owner.session_uid not in shown or solid.hide_render):
             continue
         if owners is not None and owner.session_uid not in owners:
             continue

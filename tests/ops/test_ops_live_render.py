@@ -198,6 +198,25 @@ def test_what_the_window_shows_is_not_what_is_rendered(wing, settings, tmp_path,
     assert np.abs(moving[0] - moving[2]).max() > 0.1
 
 
+def test_a_shadow_that_is_hidden_in_some_frames(wing, settings, make, eye):
+    """Its own hiding is animated; it is hidden in the frame that the window shows."""
+    lid = make([(-1, -1, -0.3), (1, -1, -0.3), (1, 1, -0.3), (-1, 1, -0.3)], [(3, 2, 1, 0)], "Lid")
+    lid.rotation_euler, lid.location = (0.9, 0, 0), (0, 1.2, 0.9)
+    settings.occluders = "VISIBLE"
+    lid.select_set(False)
+    wing.select_set(True)
+    bpy.context.view_layer.objects.active = wing
+    _hidden(lid)
+    bpy.ops.neural_gash.bake()
+    settings.live = True
+    moving = eye.moving()
+    settings.live = False
+    for frame, picture in zip(FRAMES, moving, strict=True):
+        bpy.context.scene.frame_set(frame)
+        bpy.ops.neural_gash.bake()
+        np.testing.assert_allclose(picture, eye.still(), atol=2e-3)
+
+
 def test_a_preview_that_turns_is_lit_as_it_stands_in_each_rendered_frame(wing, settings, eye):
     """Without Live, and also where the light changes."""
     wing.shape_key_clear()
@@ -209,6 +228,16 @@ def test_a_preview_that_turns_is_lit_as_it_stands_in_each_rendered_frame(wing, s
         bpy.context.scene.frame_set(frame)
         np.testing.assert_allclose(picture, eye.still(), atol=2e-3)
     assert np.abs(moving[0] - moving[2]).max() > 0.1
+
+
+def test_a_sun_that_is_hidden_in_the_frame_that_the_window_shows(wing, settings, eye):
+    _sun()
+    _hidden(bpy.data.objects["Sun"])
+    moving = eye.moving()
+    for frame, picture in zip(FRAMES, moving, strict=True):
+        bpy.context.scene.frame_set(frame)
+        np.testing.assert_allclose(picture, eye.still(), atol=2e-3)
+    assert moving[0].reshape(-1, 4)[:, :3].max() > 0.1
 
 
 def test_bounces_are_followed_in_rendered_frames(wing, settings, eye):
