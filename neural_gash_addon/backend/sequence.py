@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The transfer of every frame of an animation in one file, which is mapped and not read.
+"""The transfer of every frame of an animation in one file, of which a frame at a time is mapped.
 
 A safetensors file (see `weights`): `coefficients` (frames, N, K) as 16-bit floats, exact to a two-thousandth, which is
 below the error of any bake; `elements` (E,), the point of each vertex or face corner. Its metadata: the record
@@ -28,17 +28,29 @@ _ROOM, _ROOM_PER_FRAME = 1 << 14, 1 << 10  # bytes of the header, which is writt
 
 @dataclass(frozen=True, eq=False)
 class Sequence:
-    """A file of a `Writer`, open."""
+    """A file of a `Writer`. No map of it is kept: reading one of a file that was cut ends the process, and on Windows
+    no mapped file can be replaced."""
 
+    path: Path
     first: int                            # frame
-    coefficients: NDArray[np.float16]     # (frames, N, K), mapped
+    start: int                            # byte at which the coefficients begin
+    shape: tuple[int, ...]                # of those of a frame: (N, K) or (N, K, 3)
     elements: NDArray[np.int32]           # (E,)
     records: list[BakeRecord]             # of each frame
 
     def frame(self, number: int) -> tuple[NDArray[np.float32], BakeRecord]:
-        """The coefficients (N, K) of a frame and their record; of the nearest one that there is."""
+        """The coefficients (N, K) of a frame and their record; of the nearest one that there is.
+
+        Raises:
+            UserError: the file is gone or cut.
+        """
         index = int(np.clip(number - self.first, 0, len(self.records) - 1))
-        return self.coefficients[index].astype(np.float32), self.records[index]
+        count = int(np.prod(self.shape))
+        try:
+            mapped = np.memmap(self.path, "<f2", "r", self.start + 2 * count * index, self.shape)
+            return np.array(mapped, np.float32), self.records[index]
+        except (OSError, ValueError) as error:
+            raise UserError(f"'{self.path}' is missing or cut.") from error
 
 
 class Writer:
@@ -105,7 +117,7 @@ class Writer:
 
 
 def open_sequence(path: Path) -> Sequence:
-    """Map a file.
+    """What a file holds, but for the coefficients.
 
     Raises:
         UserError: it is missing, cut, or none that a `Writer` wrote.
@@ -120,13 +132,13 @@ def open_sequence(path: Path) -> Sequence:
         base = BakeRecord.from_json(about["record"])
         records = [replace(base, **{**entry, "frame": tuple(entry.get("frame", base.frame))})
                    for entry in json.loads(about["frames"])]
-        arrays = {name: np.memmap(path, kind, "r", 8 + length + header[name]["data_offsets"][0],
-                                  tuple(header[name]["shape"]))
-                  for name, kind in (("coefficients", "<f2"), ("elements", "<i4"))}
-        shape, elements = arrays["coefficients"].shape, arrays["elements"]
+        start, place = (8 + length + header[name]["data_offsets"][0] for name in ("coefficients", "elements"))
+        shape, (count,) = tuple(header["coefficients"]["shape"]), header["elements"]["shape"]
+        elements = np.fromfile(path, "<i4", count, offset=place)
         held = (len(records), base.points, base.order ** 2, 3)[:3 if base.colours == 1 else 4]
-        if shape != held or not len(elements) or elements.min() < 0 or elements.max() >= base.points:
+        if (shape != held or place < start + 2 * np.prod(shape) or not 0 < count == len(elements)
+                or elements.min() < 0 or elements.max() >= base.points):
             raise ValueError(shape)
-        return Sequence(int(about["first"]), arrays["coefficients"], np.array(arrays["elements"]), records)
+        return Sequence(path, int(about["first"]), start, shape[1:], elements, records)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, struct.error) as error:
         raise UserError(f"'{path}' is missing or no sequence that Neural GASh baked.") from error

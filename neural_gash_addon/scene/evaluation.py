@@ -48,17 +48,25 @@ def revealed(objects: Iterable[bpy.types.Object], depsgraph: bpy.types.Depsgraph
         bpy.data.scenes.remove(scene)
 
 
-def shown_objects(layer: bpy.types.ViewLayer) -> set[int]:
-    """Session uids of the objects that the viewport shows and a render of this view layer would.
+def scene_objects(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> list[bpy.types.Object]:
+    """The objects of a scene, then those of which it has instances alone, as of a collection that is not in it."""
+    found = dict.fromkeys(scene.objects)
+    found.update(dict.fromkeys(one.original for one in depsgraph.ids if isinstance(one, bpy.types.Object)))
+    return list(found)
 
-    The dependency graph lists objects of hidden collections too.
+
+def shown_objects(depsgraph: bpy.types.Depsgraph) -> set[int]:
+    """Session uids of the objects that the viewport shows and a render of the depsgraph's view layer would.
+
+    The dependency graph lists objects of hidden collections too; but what is animated is in a render right there only.
     """
+    layer = depsgraph.view_layer
     rendered: set[int] = set()
     front = [layer.layer_collection]
     while front:
         place = front.pop()
         if place.exclude or place.collection.hide_render:
             continue
-        rendered |= {o.session_uid for o in place.collection.objects if not o.hide_render}
+        rendered |= {o.session_uid for o in place.collection.objects if not o.evaluated_get(depsgraph).hide_render}
         front += place.children
     return {o.session_uid for o in layer.objects if o.session_uid in rendered and o.visible_get(view_layer=layer)}

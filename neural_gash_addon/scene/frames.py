@@ -25,6 +25,14 @@ def rotation_part(matrix: Array) -> Array:
     return rotation if np.linalg.det(rotation) > 0 else -rotation
 
 
-def bake_frame(obj: bpy.types.Object) -> Array:
-    """Rotation part (3, 3) of the object's world matrix, determinant 1."""
-    return rotation_part(as_array(obj.matrix_world))
+def world_matrix(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> Array:
+    """The object's world matrix (4, 4): that of the frame which a depsgraph is of, where one is given.
+
+    A render has a depsgraph of its own; the object itself stands as it does in the frame that the window shows.
+    """
+    return as_array((obj.evaluated_get(depsgraph) if depsgraph else obj).matrix_world)
+
+
+def bake_frame(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> Array:
+    """Rotation part (3, 3) of `world_matrix`, determinant 1."""
+    return rotation_part(world_matrix(obj, depsgraph))

@@ -42,7 +42,7 @@ class _Part:
 
 def is_shown(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
     """Whether `read_lamps` finds an object without being told of it."""
-    return obj.session_uid in shown_objects(depsgraph.view_layer)
+    return obj.session_uid in shown_objects(depsgraph)
 
 
 def read_lamps(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[LitScene, str, str]:
@@ -183,14 +183,14 @@ def _energy(lamp: bpy.types.Object) -> Array:
 
 def _shown_lamps(depsgraph: bpy.types.Depsgraph) -> Iterator[tuple[bpy.types.Object, Array]]:
     """The lamps and their instances that renders show, and that light diffuse surfaces; and their world matrices."""
-    shown = shown_objects(depsgraph.view_layer)
+    shown = shown_objects(depsgraph)
     for instance in depsgraph.object_instances:
         lamp = instance.object
         if lamp.type != "LIGHT" or not instance.show_self:
             continue
         owner = (instance.parent if instance.is_instance else lamp).original
         portal = getattr(getattr(lamp.data, "cycles", None), "is_portal", False) and lamp.data.type == "AREA"
-        if owner.session_uid in shown and not lamp.original.hide_render and lamp.visible_diffuse and not portal:
+        if owner.session_uid in shown and not lamp.hide_render and lamp.visible_diffuse and not portal:
             yield lamp, as_array(instance.matrix_world)
 
 

@@ -16,14 +16,14 @@ from ..backend import light as sh_light
 from ..backend import spherical_harmonics as sh
 from ..backend.errors import UserError
 from .attributes import has_bake, read_record
-from .frames import as_array, bake_frame
+from .frames import bake_frame, world_matrix
 from .preview import is_glossy, is_on, preview_on, update_light
 from .views import LIT, view_light
 from .world import checked, current_depsgraph, file_light, forget_image, rotated_light, suns_light, world_light
 
 WORLD, HDRI, SUNS, SKY = "WORLD", "HDRI", "SUNS", "SKY"  # where light is taken from
 
-_turns: dict[int, bytes] = {}  # session uid of an object -> its rotation when its preview was last lit for turning
+_turns: dict[int, bytes] = {}  # session uid of an object -> its rotation when its preview was last lit
 _problems: dict[int, str] = {}  # session uid of a scene -> why its light cannot be read
 _LIGHT = "neural_gash_light"  # custom property of the scene: (K, 3) of the highest order, flat
 
@@ -71,7 +71,7 @@ def follow_light(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None =
     except UserError:
         return
     if before is None or before != scene[_LIGHT][:]:
-        apply_light(scene)
+        apply_light(scene, depsgraph)
 
 
 def problem(scene: bpy.types.Scene) -> str:
@@ -96,11 +96,11 @@ def current_light(scene: bpy.types.Scene, order: int) -> np.ndarray:
     return sh_light.window(light, order) if settings.soften else light
 
 
-def apply_light(scene: bpy.types.Scene) -> None:
+def apply_light(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     """Light every preview in the scene. Damaged bakes keep the light they have."""
     for obj in scene.objects:
         if is_on(obj):
-            light_object(scene, obj)
+            light_object(scene, obj, depsgraph)
 
 
 @persistent
@@ -111,12 +111,10 @@ def _on_change(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     for update in depsgraph.updates:
         if isinstance(update.id, bpy.types.Object) and update.is_updated_transform:
             obj = update.id.original
-            if not is_on(obj) or not np.isfinite(as_array(obj.matrix_world)).all():
+            if not is_on(obj) or not np.isfinite(world_matrix(obj, depsgraph)).all():
                 continue
-            turned = bake_frame(obj).round(6).tobytes()
-            if turned != _turns.get(obj.session_uid):  # lighting it changes its material, which is a change again
-                _turns[obj.session_uid] = turned
-                light_object(scene, obj)
+            if _turned(obj, depsgraph) != _turns.get(obj.session_uid):  # lighting it is a change of its material again
+                light_object(scene, obj, depsgraph)
 
 
 @persistent
@@ -181,14 +179,22 @@ def _on_load(*_: object) -> None:
                 light_object(scene, obj)
 
 
-def light_object(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
-    """Light the preview of one object, where it is on."""
+def _turned(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None) -> bytes:
+    """The rotation of an object, to compare."""
+    return bake_frame(obj, depsgraph).round(6).tobytes()
+
+
+def light_object(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> None:
+    """Light the preview of one object, where it is on. depsgraph: of the frame that is meant (`world_matrix`)."""
+    if np.isfinite(world_matrix(obj, depsgraph)).all():
+        _turns[obj.session_uid] = _turned(obj, depsgraph)
     try:
         record, view = read_record(obj), scene.neural_gash.view
         if view == LIT:
-            update_light(obj, current_light(scene, record.order), lamps=scene.neural_gash.lamps_strength)
+            update_light(obj, current_light(scene, record.order), lamps=scene.neural_gash.lamps_strength,
+                         depsgraph=depsgraph)
         else:
-            update_light(obj, view_light(obj, record, view, scene.neural_gash.coefficient), tint=0.0,
-                         lamps=0.0)
+            light = view_light(obj, record, view, scene.neural_gash.coefficient, depsgraph)
+            update_light(obj, light, tint=0.0, lamps=0.0, depsgraph=depsgraph)
     except UserError:
         return  # the panel says that the bake is damaged

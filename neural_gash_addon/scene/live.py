@@ -23,7 +23,7 @@ from ..backend.transfer import Transfer
 from . import rendered as renders
 from .attributes import SEQUENCE, has_bake, read_record, write_transfer
 from .deforming import Deforming
-from .evaluation import shown_objects
+from .evaluation import scene_objects, shown_objects
 from .frames import rotation_part
 from .lighting import light_object
 from .playback import forget_files, show_frame
@@ -96,7 +96,7 @@ def start(scene: bpy.types.Scene) -> None:
     if _suspended:
         return  # the frame that is set after it has all followed
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    for obj in _followed(scene, rendered=False):
+    for obj in _followed(scene, depsgraph, rendered=False):
         try:
             record = _followable(obj)
             follower = _followers.setdefault(obj.session_uid, _Follower())
@@ -127,7 +127,7 @@ def follow(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, rendered: boo
     written: list[bpy.types.Object] = []
     if not scene.neural_gash.live:
         return written
-    for obj in _followed(scene, rendered):
+    for obj in _followed(scene, depsgraph, rendered):
         try:
             if changed is not None and obj.session_uid not in changed and read_record(obj).occluders == SELF:
                 continue
@@ -139,11 +139,11 @@ def follow(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, rendered: boo
     return written
 
 
-def _followed(scene: bpy.types.Scene, rendered: bool) -> list[bpy.types.Object]:
+def _followed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, rendered: bool) -> list[bpy.types.Object]:
     """The objects whose bakes follow; of several with the same mesh, the first."""
     found: dict[int, bpy.types.Object] = {}
-    for obj in scene.objects:
-        shown = not obj.hide_render if rendered else obj.visible_get()
+    for obj in scene_objects(scene, depsgraph) if rendered else scene.objects:
+        shown = not obj.evaluated_get(depsgraph).hide_render if rendered else obj.visible_get()
         if has_bake(obj) and SEQUENCE not in obj.data and shown and obj.mode != "EDIT":
             found.setdefault(obj.data.session_uid, obj)
     return list(found.values())
@@ -196,7 +196,7 @@ def _update(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types.
     record = replace(transfer.record, occluders=before.occluders, fingerprint=now, frame=frame)
     write_transfer(obj, mesh.elements, replace(transfer, record=record))
     if frame != before.frame or record.colours != before.colours:
-        light_object(scene, obj)
+        light_object(scene, obj, depsgraph)
     follower.seconds = time.perf_counter() - began
     if not rendered:
         _adapt(follower, baked)
@@ -245,31 +245,34 @@ def _adapt(follower: _Follower, baked: float) -> None:
             follower.plan = better
 
 
-def _animate_again(scene: bpy.types.Scene, written: Collection[bpy.types.Object]) -> None:
+def _animate_again(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph,
+                   written: Collection[bpy.types.Object]) -> None:
     """Have what animates objects evaluated once more after their meshes were written to in a new frame.
 
     A mesh that changed is evaluated again from the originals of the mesh, its shape keys and its objects. In the window
     these hold the values of the frame; but a render has a dependency graph of its own, and they would be those of the
     frame that the window shows. Not while posing: values that a person has not keyed yet would be lost.
     """
+    if not written:
+        return
     meshes = {obj.data for obj in written}
-    changed: set[bpy.types.ID] = {obj for obj in scene.objects if obj.data in meshes}
+    changed: set[bpy.types.ID] = {obj for obj in scene_objects(scene, depsgraph) if obj.data in meshes}
     changed |= meshes | {mesh.shape_keys for mesh in meshes if mesh.shape_keys}
     for one in changed:
         one.update_tag(refresh={"TIME"})
 
 
-def play(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+def play(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> list[bpy.types.Object]:
     """Show of each object with a sequence the frame that is current; the nearest, beyond its ends. Gives those written.
     """
     shown: set[int] = set()
     written = []
-    for obj in scene.objects:
+    for obj in scene_objects(scene, depsgraph):
         if obj.type != "MESH" or SEQUENCE not in obj.data or obj.data.session_uid in shown or obj.mode == "EDIT":
             continue
         shown.add(obj.data.session_uid)
         try:
-            if show_frame(scene, obj):
+            if show_frame(scene, obj, depsgraph):
                 written.append(obj)
             _problems.pop(obj.session_uid, None)
         except UserError as error:
@@ -286,7 +289,7 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
                if isinstance(update.id, bpy.types.Object)
                and (update.is_updated_geometry or update.is_updated_transform)}
     if any(isinstance(update.id, (bpy.types.Scene, bpy.types.Collection)) for update in depsgraph.updates):
-        shown = frozenset(shown_objects(depsgraph.view_layer))  # what is hidden or removed is itself no update
+        shown = frozenset(shown_objects(depsgraph))  # what is hidden or removed is itself no update
         changed |= _shown.get(scene.session_uid, frozenset()) ^ shown
         _shown[scene.session_uid] = shown
     if changed:
@@ -297,10 +300,10 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
 def _on_frame(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Follow what is animated, before it is drawn or rendered."""
     if not _suspended:
-        written = play(scene) + follow(scene, depsgraph, bpy.app.background or _rendering)
+        written = play(scene, depsgraph) + follow(scene, depsgraph, bpy.app.background or _rendering)
         if _rendering:
             renders.show_what_fits(scene, depsgraph, _problems)
-        _animate_again(scene, written)
+        _animate_again(scene, depsgraph, written)
 
 
 @persistent
@@ -329,8 +332,15 @@ def _on_rendered(*_: object) -> None:
         bpy.app.timers.register(renders.show_all)  # renders of a window end in a thread of their own
 
 
+@persistent
+def _on_save(*_: object) -> None:
+    """A file saved in the midst of a render has all its previews; the next frame looks again."""
+    renders.show_all()
+
+
 _HANDLERS = (("depsgraph_update_post", _on_update), ("frame_change_post", _on_frame), ("load_post", _on_load),
-             ("render_init", _on_render), ("render_complete", _on_rendered), ("render_cancel", _on_rendered))
+             ("save_pre", _on_save), ("render_init", _on_render), ("render_complete", _on_rendered),
+             ("render_cancel", _on_rendered))
 
 
 def register() -> None:

@@ -11,42 +11,45 @@ from ..backend.sequence import Sequence, open_sequence
 from ..backend.transfer import Transfer
 from .attributes import SEQUENCE, read_record, write_transfer
 from .lighting import light_object
-from .read import same_fingerprint
+from .read import refusal, same_fingerprint
 
-_files: dict[str, tuple[float, Sequence]] = {}  # path -> when the file was written, and the file
+_files: dict[Path, tuple[tuple[int, ...], Sequence]] = {}  # path -> which file it was, and what it holds
 
 
-def show_frame(scene: bpy.types.Scene, obj: bpy.types.Object) -> bool:
+def show_frame(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
     """Write the current frame of an object's sequence to it, the nearest beyond its ends; False if it is there already.
 
     Raises:
-        UserError: the file is missing or damaged, or the mesh is another.
+        UserError: the file is missing or damaged, or the mesh is another, or linked from another file.
     """
+    reason = refusal(obj)
+    if reason:
+        raise UserError(reason)
     before = read_record(obj)
-    sequence = _sequence(str(obj.data[SEQUENCE]))
+    sequence = _sequence(Path(bpy.path.abspath(str(obj.data[SEQUENCE]))))
     coefficients, record = sequence.frame(scene.frame_current)
     if same_fingerprint(record.fingerprint, before.fingerprint):
         return False
     name = obj.data[SEQUENCE]
     write_transfer(obj, sequence.elements, Transfer(coefficients, record))
     obj.data[SEQUENCE] = name
-    if record.frame != before.frame or record.colours != before.colours:
-        light_object(scene, obj)
+    if (record.frame, record.order, record.colours) != (before.frame, before.order, before.colours):
+        light_object(scene, obj, depsgraph)
     return True
 
 
 def forget_files() -> None:
-    """Hold no file any more."""
+    """Know no file any more."""
     _files.clear()
 
 
-def _sequence(name: str) -> Sequence:
-    """The file that a mesh names, mapped once. Raises UserError."""
-    path = Path(bpy.path.abspath(name))
+def _sequence(path: Path) -> Sequence:
+    """A file, its records read once. Raises UserError."""
     try:
-        written = path.stat().st_mtime
+        found = path.stat()
     except OSError as error:
         raise UserError(f"The sequence '{path}' is missing; bake it again, or clear the bake.") from error
-    if name not in _files or _files[name][0] != written:
-        _files[name] = written, open_sequence(path)
-    return _files[name][1]
+    written = found.st_mtime_ns, found.st_size, found.st_ino
+    if path not in _files or _files[path][0] != written:
+        _files[path] = written, open_sequence(path)
+    return _files[path][1]

@@ -17,7 +17,7 @@ from ..backend.geometry import TEXEL
 from ..backend.record import BakeRecord
 from .attributes import attribute_names, check_whole, has_bake, read_record
 from .emission import emits_alone, emitters, set_glow
-from .frames import as_array, bake_frame
+from .frames import bake_frame, world_matrix
 from .gloss import can_gloss, gloss_group, gloss_whole, light_gloss
 from .gloss_nodes import SPECULAR, is_gloss, lobe_of
 from .images import bake_images, remove_unused
@@ -108,24 +108,26 @@ def preview_off(obj: bpy.types.Object) -> None:
     _remove_unused(found)
 
 
-def update_light(obj: bpy.types.Object, light: NDArray, tint: float = 1.0, lamps: float = 1.0) -> None:
+def update_light(obj: bpy.types.Object, light: NDArray, tint: float = 1.0, lamps: float = 1.0,
+                 depsgraph: bpy.types.Depsgraph | None = None) -> None:
     """Light the preview of `obj`, where it is on. Sets socket values only, so no shader recompiles.
 
     Args:
         light: (K, 3) in world axes, of the bake's order or higher. It is turned into the frame of
             the bake, so the object may have been rotated since.
         tint: how much of the materials' colours a dull preview shows. lamps: factor on the light of baked lamps.
+        depsgraph: of the frame in which the object stands so (`world_matrix`).
     Raises:
         UserError: the record of the bake is damaged.
         ValueError: the light is of a lower order than the bake.
     """
-    if not (is_on(obj) and has_bake(obj)) or obj.library or not np.isfinite(as_array(obj.matrix_world)).all():
+    if not (is_on(obj) and has_bake(obj)) or obj.library or not np.isfinite(world_matrix(obj, depsgraph)).all():
         return
     record = read_record(obj)
     terms = record.order ** 2
     if len(light) < terms:
         raise ValueError(f"the light has {len(light)} coefficients, the bake {terms}")
-    turn = turn_since(obj, record)
+    turn = turn_since(obj, record, depsgraph)
     seen = sh.rotate(np.asarray(light)[:terms], turn)
     holds = record.order, record.colours, bool(record.lamps)
     if any(not is_gloss(node.node_tree) and group_terms(node.node_tree) != holds
@@ -145,9 +147,9 @@ def update_light(obj: bpy.types.Object, light: NDArray, tint: float = 1.0, lamps
             set_light(node, seen, tint, lamps)
 
 
-def turn_since(obj: bpy.types.Object, record: BakeRecord) -> NDArray:
+def turn_since(obj: bpy.types.Object, record: BakeRecord, depsgraph: bpy.types.Depsgraph | None = None) -> NDArray:
     """(3, 3) from world axes into the frame of a bake: the identity unless the object was turned since."""
-    return np.array(record.frame).reshape(3, 3) @ bake_frame(obj).T
+    return np.array(record.frame).reshape(3, 3) @ bake_frame(obj, depsgraph).T
 
 
 def is_preview(material: bpy.types.Material) -> bool:

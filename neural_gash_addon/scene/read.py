@@ -62,16 +62,24 @@ class SceneMesh:
 
 def refusal(obj: bpy.types.Object | None) -> str:
     """Why `obj` cannot be baked at all, in one sentence; '' where it can. Reads no geometry."""
-    if obj is None:
-        return "No object is active; click a mesh object to make it the active one."
-    if obj.type != "MESH":
-        return f"'{obj.name}' is not a mesh object ({obj.type.title()}); convert it to a mesh to bake it."
+    reason = _unreadable(obj)
+    if reason or obj is None:
+        return reason
     if obj.library or obj.data.library:
         return (f"'{obj.name}' is linked from another file, where a bake cannot be stored; "
                 "make its object and mesh local to bake it.")
     if obj.data.override_library:
         return (f"The mesh of '{obj.name}' is a library override, which cannot store a bake; "
                 "make it local to bake it.")
+    return ""
+
+
+def _unreadable(obj: bpy.types.Object | None) -> str:
+    """`refusal`, but for where a bake cannot be stored."""
+    if obj is None:
+        return "No object is active; click a mesh object to make it the active one."
+    if obj.type != "MESH":
+        return f"'{obj.name}' is not a mesh object ({obj.type.title()}); convert it to a mesh to bake it."
     if obj.data.is_editmode:  # its own mode, or that of another object with the same mesh
         return f"'{obj.name}' is in Edit Mode, which would discard the bake; leave Edit Mode to bake it."
     if not obj.data.polygons:
@@ -223,9 +231,9 @@ def fingerprint(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, occluder_
     and with bounces the albedo of everything.
 
     Raises:
-        UserError: as `read_object`.
+        UserError: as `read_object`; but what is linked from another file has one.
     """
-    reason = refusal(obj)
+    reason = _unreadable(obj)
     if reason:
         raise UserError(reason)
     with evaluated(obj, depsgraph) as copy:

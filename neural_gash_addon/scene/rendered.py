@@ -9,12 +9,14 @@ import bpy
 
 from ..backend.errors import UserError
 from .attributes import SEQUENCE, has_bake
+from .evaluation import scene_objects
 from .lighting import light_object
 from .preview import is_on, preview_off, preview_on
 from .staleness import fits
 
 _LOGGER = logging.getLogger(__name__)
-_aside: set[int] = set()  # session uids of the objects whose preview is off until their bake fits, or the render ends
+# session uids of the objects whose preview is off until their bake fits, or the render ends -> the scene rendered
+_aside: dict[int, str] = {}
 
 
 def show_what_fits(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, problems: Mapping[int, str]) -> None:
@@ -25,26 +27,29 @@ def show_what_fits(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, probl
     Args:
         problems: why objects could not be followed, by their session uids.
     """
-    for obj in scene.objects:
-        if (not has_bake(obj) or obj.hide_render or obj.library or obj.data.is_editmode
+    for obj in scene_objects(scene, depsgraph):
+        if (not has_bake(obj) or obj.evaluated_get(depsgraph).hide_render or obj.data.is_editmode
                 or not (scene.neural_gash.live or SEQUENCE in obj.data)
                 or not (is_on(obj) or obj.session_uid in _aside)):
             continue
         if fits(obj, depsgraph):
-            _show(scene, obj)
-        elif is_on(obj):
-            _LOGGER.warning("Frame %d: the bake of '%s' does not fit, so its own materials are rendered. %s",
-                            scene.frame_current, obj.name, problems.get(obj.session_uid, ""))
-            _aside.add(obj.session_uid)
-            preview_off(obj)
+            _show(scene, obj, depsgraph)
+        elif is_on(obj) and obj.session_uid not in _aside:
+            _LOGGER.warning("Frame %d: the bake of '%s' does not fit, so %s. %s", scene.frame_current, obj.name,
+                            "its shadows are wrong" if obj.library else "its own materials are rendered",
+                            problems.get(obj.session_uid, ""))
+            _aside[obj.session_uid] = scene.name
+            if not obj.library:  # whose slots cannot be changed
+                preview_off(obj)
 
 
 def show_all() -> None:
     """Show all again that was put aside."""
     if not _aside:
         return
-    for scene in bpy.data.scenes:
-        for obj in scene.objects:
+    for obj in bpy.data.objects:
+        scene = bpy.data.scenes.get(_aside.get(obj.session_uid, ""))
+        if scene is not None:
             _show(scene, obj)
     _aside.clear()
 
@@ -54,13 +59,15 @@ def forget() -> None:
     _aside.clear()
 
 
-def _show(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
+def _show(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     """Show a bake that was put aside."""
     if obj.session_uid not in _aside:
         return
-    _aside.discard(obj.session_uid)
+    del _aside[obj.session_uid]
+    if is_on(obj):
+        return
     try:
         preview_on(obj, scene.neural_gash.lobe_shown())
     except UserError as error:
         _LOGGER.warning("The preview of '%s' stays off. %s", obj.name, error)
-    light_object(scene, obj)
+    light_object(scene, obj, depsgraph)

@@ -28,7 +28,7 @@ def instances(depsgraph: bpy.types.Depsgraph, owners: set[int] | None = None, ba
         finishing: the finish is empty where not given.
     """
     known: dict[tuple[int, int], tuple[NDArray, NDArray, Finish] | None] = {}
-    shown = shown_objects(depsgraph.view_layer) if owners is None else set()
+    shown = shown_objects(depsgraph) if owners is None else set()
     for instance in depsgraph.object_instances:
         solid = instance.object
         if solid.type != "MESH" or not instance.show_self:  # curves, texts and balls come as meshes too
@@ -36,7 +36,7 @@ def instances(depsgraph: bpy.types.Depsgraph, owners: set[int] | None = None, ba
         owner = (instance.parent if instance.is_instance else solid).original
         if owner == baked and not instance.is_instance:
             continue
-        if owners is None and (owner.session_uid not in shown or solid.original.hide_render):
+        if owners is None and (owner.session_uid not in shown or solid.hide_render):
             continue
         if owners is not None and owner.session_uid not in owners:
             continue

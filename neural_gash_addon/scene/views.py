@@ -17,7 +17,8 @@ _SHADING = "neural_gash_shading"     # custom properties of a screen: how its vi
 _ACTIVE = "neural_gash_active_color"  # custom property of a mesh: the colours that were active before its errors
 
 
-def view_light(obj: bpy.types.Object, record: BakeRecord, view: str, coefficient: int) -> NDArray[np.float64]:
+def view_light(obj: bpy.types.Object, record: BakeRecord, view: str, coefficient: int,
+               depsgraph: bpy.types.Depsgraph | None = None) -> NDArray[np.float64]:
     """The light (K, 3), in world axes, under which the preview of `obj` shows a part of its bake.
 
     Ambient occlusion is a white sky of radiance 1. A coefficient k is a light of that one alone, of the bake's own
@@ -31,7 +32,7 @@ def view_light(obj: bpy.types.Object, record: BakeRecord, view: str, coefficient
     light = np.zeros((terms, 3))
     if coefficient < terms:
         light[coefficient] = np.sqrt(4 * np.pi) * np.array([1.0, 0.0, -1.0])
-    return sh.rotate(light, turn_since(obj, record).T)
+    return sh.rotate(light, turn_since(obj, record, depsgraph).T)
 
 
 def has_errors(obj: bpy.types.Object | None) -> bool:

@@ -227,13 +227,13 @@ def _suns(depsgraph: bpy.types.Depsgraph) -> list[tuple[Array, Array]]:
     suns: list[tuple[Array, Array]] = []
     if not any(lamp.type == "SUN" for lamp in bpy.data.lights):
         return suns  # a scene may have very many instances
-    shown = shown_objects(depsgraph.view_layer)
+    shown = shown_objects(depsgraph)
     for instance in depsgraph.object_instances:
         lamp = instance.object
         if lamp.type != "LIGHT" or lamp.data.type != "SUN":
             continue
         owner = (instance.parent if instance.is_instance else lamp).original
-        if owner.session_uid not in shown or lamp.original.hide_render or not instance.show_self:
+        if owner.session_uid not in shown or lamp.hide_render or not instance.show_self:
             continue
         direction = np.array(instance.matrix_world, dtype=np.float64)[:3, 2]
         length = np.linalg.norm(direction)

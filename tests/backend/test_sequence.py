@@ -46,9 +46,22 @@ def test_every_frame_comes_back(tmp_path):
         assert record == transfer.record
     np.testing.assert_array_equal(sequence.elements, MESH.elements)
     assert sequence.frame(-99)[1] == transfers[0].record and sequence.frame(99)[1] == transfers[-1].record
-    assert isinstance(sequence.coefficients, np.memmap)
     bare = 4 * len(MESH.points) * 9 * 2
     assert bare < path.stat().st_size < bare + 4 * len(MESH.elements) + (1 << 14) + 4 * (1 << 10) + 9
+
+
+def test_cut_after_it_was_opened(tmp_path):
+    """Were it mapped, that would end the process."""
+    path = tmp_path / "a.prtseq"
+    write(path, frames(40)).end()
+    sequence = open_sequence(path)
+    with open(path, "r+b") as file:
+        file.truncate(100)
+    with pytest.raises(UserError, match="missing or cut"):
+        sequence.frame(44)
+    path.unlink()
+    with pytest.raises(UserError, match="missing or cut"):
+        sequence.frame(5)
 
 
 def test_it_is_a_safetensors_file(tmp_path):

@@ -12,7 +12,7 @@ bpy = pytest.importorskip("bpy")
 from neural_gash_addon.backend import methods  # noqa: E402
 from neural_gash_addon.backend.sequence import open_sequence  # noqa: E402
 from neural_gash_addon.ops.sequence import Steps, bake_sequence  # noqa: E402
-from neural_gash_addon.scene import attributes, live, read, staleness  # noqa: E402
+from neural_gash_addon.scene import attributes, live, preview, read, rendered, staleness  # noqa: E402
 
 LINE = np.linspace(-1, 1, 9)
 SHEET = [(x, y, 0.0) for y in LINE for x in LINE]
@@ -205,6 +205,39 @@ def test_linked(sheet, settings, tmp_path, capfd):
     bpy.context.scene.collection.objects.link(new)
     bpy.context.scene.frame_set(3)
     quiet(capfd)
+
+
+@pytest.mark.parametrize("overridden", [False, True])
+def test_a_linked_sequence_is_left_as_it_is(sheet, settings, tmp_path, caplog, overridden):
+    """Blender lets nothing be stored in what is linked; renders say where the bake does not fit."""
+    sheet()
+    settings.sequence_folder = str(tmp_path)
+    bpy.ops.neural_gash.bake_sequence()
+    first = stored(bpy.data.objects["Sheet"])
+    path = str(tmp_path / "lib.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=path)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    with bpy.data.libraries.load(path, link=True) as (_, found):
+        found.objects = ["Sheet"]
+    scene, obj = bpy.context.scene, bpy.data.objects["Sheet"]
+    if overridden:
+        obj = obj.override_create()
+    scene.collection.objects.link(obj)
+    scene.frame_set(1)
+    assert staleness.status(obj) == staleness.CURRENT
+    scene.frame_set(3)
+    assert staleness.status(obj) == staleness.STALE and "make" in live.problem(obj)
+    np.testing.assert_array_equal(stored(obj), first)
+    scene.camera = bpy.data.objects.new("Eye", bpy.data.cameras.new("Eye"))
+    scene.render.engine, scene.cycles.samples = "CYCLES", 1
+    scene.render.resolution_x = scene.render.resolution_y = 8
+    scene.render.filepath, scene.frame_end = str(tmp_path / "r"), 3
+    scene.frame_set(1)
+    bpy.ops.render.render(animation=True)
+    said = [record.message for record in caplog.records if "does not fit" in record.message]
+    assert len(said) == 1 and said[0].startswith("Frame 2:")
+    assert ("own materials" if overridden else "shadows are wrong") in said[0]
+    assert preview.is_on(obj) and not rendered._aside
 
 
 def test_cut_while_it_plays(sheet, settings, tmp_path, capfd):

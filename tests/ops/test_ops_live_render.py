@@ -73,6 +73,57 @@ def _twist(obj):
         twist.keyframe_insert("angle", frame=frame)
 
 
+def _sun():
+    """Light from one side, which shows how an object is turned."""
+    scene = bpy.context.scene
+    scene.neural_gash.light_source = "SUNS"
+    lamp = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
+    lamp.rotation_euler, lamp.data.energy = (0.6, 0.3, 0), 3
+    scene.collection.objects.link(lamp)
+    bpy.ops.neural_gash.read_light()
+
+
+def _key(obj, path, *values):
+    """A property with these values in frames 1 and 10; frame 1 is shown."""
+    for frame, value in zip((1, 10), values, strict=True):
+        setattr(obj, path, value)
+        obj.keyframe_insert(path, frame=frame)
+    bpy.context.scene.frame_set(1)
+
+
+def _turn(obj):
+    """Turned from frame to frame, in the light of a sun."""
+    _sun()
+    _key(obj, "rotation_euler", (0, 0, 0), (2, 0, 0))
+
+
+def _parent(obj):
+    """As `_turn`, by what it is parented to."""
+    obj.parent = bpy.data.objects.new("Parent", None)
+    bpy.context.scene.collection.objects.link(obj.parent)
+    _turn(obj.parent)
+
+
+def _hidden(obj):
+    """Hidden in the frame that the window shows."""
+    obj.animation_data_clear()
+    obj.hide_render = True
+    obj.keyframe_insert("hide_render", frame=1)
+    obj.hide_render = False
+    obj.keyframe_insert("hide_render", frame=2)
+    bpy.context.scene.frame_set(1)
+
+
+def _instance(obj):
+    """In the scene as an instance of its collection only."""
+    scene = bpy.context.scene
+    empty = bpy.data.objects.new("Instance", None)
+    empty.instance_type, empty.instance_collection = "COLLECTION", bpy.data.collections.new("Kept")
+    empty.instance_collection.objects.link(obj)
+    scene.collection.objects.unlink(obj)
+    scene.collection.objects.link(empty)
+
+
 def _all(obj):
     """An armature and a driver on top of the keyed shape."""
     rig = bpy.data.objects.new("Rig", bpy.data.armatures.new("Rig"))
@@ -115,6 +166,78 @@ def test_a_render_of_the_animation_shows_no_stale_frame(wing, settings, tmp_path
         bpy.ops.neural_gash.bake()
         np.testing.assert_allclose(picture, eye.still(), atol=2e-3)
     assert np.abs(moving[0] - moving[2]).max() > 0.1
+
+
+@pytest.mark.parametrize("how", ["live", "sequence"])
+@pytest.mark.parametrize("change", [_turn, _parent, _hidden, _instance])
+def test_what_the_window_shows_is_not_what_is_rendered(wing, settings, tmp_path, eye, change, how):
+    """Where the object stands, and whether it is there, is what the render's own dependency graph says."""
+    scene = bpy.context.scene
+    scene.frame_end = 10
+    if change is not _instance:  # of which a sequence cannot be baked any more
+        change(wing)
+    if how == "sequence":
+        settings.sequence_folder = str(tmp_path)
+        bpy.ops.neural_gash.bake_sequence()
+    settings.live = how == "live"
+    if change is _instance:
+        change(wing)
+    before = [(slot.link, slot.material) for slot in wing.material_slots]
+    moving = eye.moving()
+    assert [(slot.link, slot.material) for slot in wing.material_slots] == before
+    settings.live = False
+    if change is _instance:
+        scene.collection.objects.link(wing)
+        scene.collection.objects.unlink(bpy.data.objects["Instance"])
+    wing.select_set(True)
+    bpy.context.view_layer.objects.active = wing
+    for frame, picture in zip(FRAMES, moving, strict=True):
+        scene.frame_set(frame)
+        bpy.ops.neural_gash.bake()
+        np.testing.assert_allclose(picture, eye.still(), atol=2e-3)
+    assert np.abs(moving[0] - moving[2]).max() > 0.1
+
+
+def test_a_shadow_that_is_hidden_in_some_frames(wing, settings, make, eye):
+    """Its own hiding is animated; it is hidden in the frame that the window shows."""
+    lid = make([(-1, -1, -0.3), (1, -1, -0.3), (1, 1, -0.3), (-1, 1, -0.3)], [(3, 2, 1, 0)], "Lid")
+    lid.rotation_euler, lid.location = (0.9, 0, 0), (0, 1.2, 0.9)
+    settings.occluders = "VISIBLE"
+    lid.select_set(False)
+    wing.select_set(True)
+    bpy.context.view_layer.objects.active = wing
+    _hidden(lid)
+    bpy.ops.neural_gash.bake()
+    settings.live = True
+    moving = eye.moving()
+    settings.live = False
+    for frame, picture in zip(FRAMES, moving, strict=True):
+        bpy.context.scene.frame_set(frame)
+        bpy.ops.neural_gash.bake()
+        np.testing.assert_allclose(picture, eye.still(), atol=2e-3)
+
+
+def test_a_preview_that_turns_is_lit_as_it_stands_in_each_rendered_frame(wing, settings, eye):
+    """Without Live, and also where the light changes."""
+    wing.shape_key_clear()
+    bpy.ops.neural_gash.bake()
+    _turn(wing)
+    _key(bpy.data.objects["Sun"].data, "energy", 1.0, 3.0)
+    moving = eye.moving()
+    for frame, picture in zip(FRAMES, moving, strict=True):
+        bpy.context.scene.frame_set(frame)
+        np.testing.assert_allclose(picture, eye.still(), atol=2e-3)
+    assert np.abs(moving[0] - moving[2]).max() > 0.1
+
+
+def test_a_sun_that_is_hidden_in_the_frame_that_the_window_shows(wing, settings, eye):
+    _sun()
+    _hidden(bpy.data.objects["Sun"])
+    moving = eye.moving()
+    for frame, picture in zip(FRAMES, moving, strict=True):
+        bpy.context.scene.frame_set(frame)
+        np.testing.assert_allclose(picture, eye.still(), atol=2e-3)
+    assert moving[0].reshape(-1, 4)[:, :3].max() > 0.1
 
 
 def test_bounces_are_followed_in_rendered_frames(wing, settings, eye):
@@ -178,6 +301,26 @@ def test_where_it_cannot_follow_own_materials_are_rendered(wing, settings, tmp_p
         own.append(eye.still())
     for frame, picture, plain in zip(FRAMES, moving, own, strict=True):
         assert np.allclose(picture, plain, atol=2e-3) == (frame >= first)
+
+
+def test_saved_in_the_midst_of_a_render(wing, settings, tmp_path, eye):
+    """The file has the preview, and the frames after it are still the object's own."""
+    settings.live, settings.target, settings.side = True, "TEXTURE", 32
+    bpy.ops.neural_gash.bake()
+    plain = eye.moving()
+    saved = str(tmp_path / "saved.blend")
+
+    def save(*_):
+        bpy.ops.wm.save_as_mainfile(filepath=saved, copy=True)
+    bpy.app.handlers.render_post.append(save)
+    try:
+        moving = eye.moving()
+    finally:
+        bpy.app.handlers.render_post.remove(save)
+    np.testing.assert_allclose(moving, plain, atol=2e-3)
+    assert preview.is_on(wing)
+    bpy.ops.wm.open_mainfile(filepath=saved)
+    assert preview.is_on(bpy.data.objects["Wing"]) and not rendered._aside
 
 
 def test_a_stale_bake_that_nothing_follows_is_rendered_as_it_is(wing, settings, eye, caplog):
