@@ -42,8 +42,9 @@ test-window:
 	@set -e; user=$$(mktemp -d); trap 'rm -rf "$$user"' EXIT; mkdir -p "$$user/extensions/user_default" out/window; \
 	cp -r neural_gash_addon "$$user/extensions/user_default/neural_gash"; \
 	sed -i.all '/^wheels = \[/,/^\]/d' "$$user/extensions/user_default/neural_gash/blender_manifest.toml"; \
-	BLENDER_USER_RESOURCES="$$user" $(BLENDER) --factory-startup --python-use-system-env --enable-event-simulate \
-	  --window-geometry 0 0 1280 800 --python-exit-code 1 --python tests/window/session.py -- "$(CURDIR)/out/window"
+	export BLENDER_USER_RESOURCES="$$user"; start="$(BLENDER) --factory-startup --python-use-system-env --python-exit-code 1"; \
+	$$start -b --python tests/window/background.py; \
+	$$start --enable-event-simulate --window-geometry 0 0 1280 800 --python tests/window/session.py -- "$(CURDIR)/out/window"
 
 lint: .venv/ready
 	.venv/bin/ruff check .

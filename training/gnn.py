@@ -44,7 +44,7 @@ class Net(nn.Module):
         nn.init.zeros_(self.point[-1].weight)
 
     def forward(self, seen: Tensor) -> Tensor:
-        """The blocked part (n, K) in the motor's frame, of what `cones.read` gives: (F, 25, n)."""
+        """The blocked part (n, K) in the motor's frame, of what `cones.read` gives, dense: (F, 25, n)."""
         now = self.cone[0](seen.permute(2, 1, 0)) + self.direction
         now = self.cone[1](now.relu()).relu()          # (n, 25, units)
         now = now.transpose(1, 2).flatten(1)
@@ -76,7 +76,7 @@ def example(sample: labels.Sample, count: int, rng: np.random.Generator, parts: 
     frames = gnn.frames_of(normals, over=bool(rng.integers(2)))
     voxels = cones.pyramid(geometry)
     chunks = [slice(at, at + gnn.CHUNK) for at in range(0, len(rows), gnn.CHUNK)]
-    seen = np.concatenate([cones.read(voxels, positions[rows[here]], normals[here], frames[here])
+    seen = np.concatenate([cones.read(voxels, positions[rows[here]], normals[here], frames[here]).dense()
                            for here in chunks], 2)
     blocked = sh.cosine_lobe(sample.normals[rows], labels.ORDER) - sample.coefficients[rows]
     local = sh.rotate_each(blocked, frames.transpose(0, 2, 1) @ turn)

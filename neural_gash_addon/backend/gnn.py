@@ -17,19 +17,21 @@ The networks run in NumPy; torch trains them (`training.gnn`).
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import cones, conformal
 from . import spherical_harmonics as sh
+from .cones import Seen
 from .geometry import TriangleMesh
 from .voxels import Pyramid
 from .workers import BLAS_SERIAL
 
 ORDER = 5              # bands that the network gives
 CHUNK = 4096           # points at a time, at most: many, as threads wait for each other between calls of NumPy
-_COLUMNS = 32          # of values at a time, at least: with fewer, reading the weights takes the time
+_TILE = 64             # outputs and inputs multiplied at a time, at most
 _BLEND = (-0.4, -0.6)  # heights of the normal between which the frame's pole changes
 _OVER = np.diag([1.0, -1.0, -1.0])  # half a turn about e_x
 
@@ -60,24 +62,42 @@ def frames_of(normals: NDArray, over: bool) -> NDArray[np.float64]:
     return _OVER @ frames if over else frames
 
 
-def answer(seen: NDArray[np.float32], network: Network) -> NDArray[np.float32]:
-    """The blocked part (n, ORDER**2) in the frames in which `seen` (F, 25, n) was read."""
-    features, directions, count = seen.shape
-    bias = (network["direction"] + network["cone.0.bias"]).T  # (units, 25)
-    now = _product(network["cone.0.weight"], seen.reshape(features, -1)).reshape(-1, directions, count)
+def answer(seen: Seen, network: Network) -> NDArray[np.float32]:
+    """The blocked part (n, ORDER**2) in the frames in which `seen` was read."""
+    directions, count = conformal.DIRECTION_COUNT, seen.points
+    bounds = np.searchsorted(seen.cones, np.arange(directions + 1) * count).tolist()
     # max(x + b, 0) is max(x, -b) + b, and that b goes into the next layer's: a pass less over the most numbers
-    np.maximum(now, -bias[:, :, None], out=now)
-    bias = network["cone.1.weight"] @ bias + network["cone.1.bias"][:, None]
-    now = _product(network["cone.1.weight"], now.reshape(len(now), -1)).reshape(-1, directions, count)
-    np.maximum(now, -bias[:, :, None], out=now)
+    bias = (network["direction"] + network["cone.0.bias"]).T  # (units, 25)
+    now, empty = _product(network["cone.0.weight"], seen.features), np.zeros_like(bias)
+    _clip(now, empty, bias, bounds)
+    weight = network["cone.1.weight"]
+    bias = weight @ bias + network["cone.1.bias"][:, None]
+    now, empty = _product(weight, now), weight @ empty
+    _clip(now, empty, bias, bounds)
+    # a cone with nothing in it is like all others of its direction, and about half are
+    every = np.repeat(empty, count, 1)
+    for row, values in zip(every, now, strict=True):
+        row[seen.cones] = values
     # einsum, because BLAS would spread so small a product over threads of its own
     bias = np.einsum("ij,j->i", network["point.0.weight"], bias.ravel()) + network["point.0.bias"]
-    now = _product(network["point.0.weight"], now.reshape(-1, count))  # of each unit of stage 1, all directions
+    now = _product(network["point.0.weight"], every.reshape(-1, count))  # of each unit of stage 1, all directions
     now += bias[:, None]
     np.maximum(now, 0, out=now)
     now = _layer(network, "point.1", now)
     np.maximum(now, 0, out=now)
     return _layer(network, "point.2", now).T
+
+
+def _clip(values: NDArray[np.float32], empty: NDArray[np.float32], bias: NDArray[np.float32], bounds: list[int]
+          ) -> None:
+    """max(x, -b), in place, of values (units, m) of cones and (units, 25) of empty ones, with biases (units, 25).
+
+    bounds: the cones from one to the next are of one direction.
+    """
+    np.maximum(empty, -bias, out=empty)
+    for direction, (start, stop) in enumerate(pairwise(bounds)):
+        part = values[:, start:stop]
+        np.maximum(part, -bias[:, direction, None], out=part)
 
 
 def _layer(network: Network, name: str, values: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -88,16 +108,30 @@ def _layer(network: Network, name: str, values: NDArray[np.float32]) -> NDArray[
 
 
 def _product(weight: NDArray[np.float32], values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """weight (outputs, inputs) @ values (inputs, n), as `workers.product`, in tiles: neither side is small."""
+    """weight (outputs, inputs) @ values (inputs, n), as `workers.product`, in tiles: no side is small."""
+    inputs = weight.shape[1]
+    inner = _divisor(inputs)
+    out = _tiled(weight[:, :inner], values[:inner])
+    for start in range(inner, inputs, inner):
+        out += _tiled(weight[:, start:start + inner], values[start:start + inner])
+    return out
+
+
+def _tiled(weight: NDArray[np.float32], values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The same with few inputs."""
     (outputs, inputs), count = weight.shape, values.shape[1]
-    rows = next(rows for rows in range(outputs, 0, -1)
-                if outputs % rows == 0 and (rows * inputs * _COLUMNS <= BLAS_SERIAL or rows == 1))
-    columns = min(count, max(BLAS_SERIAL // (rows * inputs), 1))
+    rows = _divisor(outputs)
+    columns = BLAS_SERIAL // (rows * inputs)
     out = np.empty((outputs, count), np.float32)
-    tiles, parts = weight.reshape(-1, 1, rows, inputs), out.reshape(-1, rows, count)
-    whole = count - count % max(columns, 1)
+    tiles, parts = weight.reshape(-1, 1, rows, inputs), out.reshape(outputs // rows, rows, count)
+    whole = count - count % columns
     if whole:
         np.matmul(tiles, values[:, :whole].reshape(inputs, -1, columns).transpose(1, 0, 2),
                   out=parts[:, :, :whole].reshape(len(parts), rows, -1, columns).transpose(0, 2, 1, 3))
     np.matmul(tiles[:, 0], values[:, whole:], out=parts[:, :, whole:])
     return out
+
+
+def _divisor(side: int) -> int:
+    """The largest that is at most _TILE."""
+    return next(part for part in range(min(side, _TILE), 0, -1) if side % part == 0)

@@ -28,20 +28,23 @@ def project_equirect(image: NDArray, order: int) -> Array:
     is a smooth trigonometric polynomial. So no resolution is too low, and two small matrix
     products do the whole map.
     """
-    height, width = image.shape[:2]
+    height, width, channels = image.shape
     longitude = _longitude_integrals(width, order)      # (W, 2*order-1)
     colatitude = _colatitude_integrals(height, order)   # (H, K)
-    rows = np.empty((height, 2 * order - 1, 3))
-    band = max(1, (1 << 20) // width)                   # rows at a time, so that a 16k map fits
-    for start in range(0, height, band):
-        block = np.nan_to_num(image[start:start + band, :, :3], nan=0.0, posinf=float(np.finfo(np.float32).max))
-        block = np.maximum(block, 0.0).astype(np.float64)
-        rows[start:start + band] = np.einsum("hwc,wm->hmc", block, longitude, optimize=True)
+    bands = [(m, band * (band + 1)) for m in range(order) for band in range(m, order)]  # -m has the same colatitude
+    legendre = np.ascontiguousarray(colatitude[:, [zero + m for m, zero in bands]].T)
+    texels = image.reshape(height, width * channels)    # all channels: their rows lie in one piece
+    columns = np.zeros((len(bands), width * channels))
+    step = max(1, (1 << 18) // (width * channels))      # rows at a time, which stay in the cache
+    for start in range(0, height, step):
+        block = np.fmax(texels[start:start + step], 0)  # NaN, too, becomes 0
+        np.minimum(block, np.finfo(np.float32).max, out=block)
+        columns += legendre[:, start:start + step] @ block.astype(np.float64)
+    columns = columns.reshape(len(bands), width, channels)[:, :, :3]
     out = np.empty((sh.coefficient_count(order), 3))
-    for l in range(order):  # noqa: E741  the band's name in every formula
-        for m in range(-l, l + 1):
-            k = l * (l + 1) + m
-            out[k] = colatitude[:, k] @ rows[:, order - 1 + m]
+    for (m, zero), column in zip(bands, columns, strict=True):
+        out[zero + m] = longitude[:, order - 1 + m] @ column
+        out[zero - m] = longitude[:, order - 1 - m] @ column
     return out
 
 

@@ -2,9 +2,9 @@
 """Surfaces pooled into a pyramid of voxels: how much area lies in each, and which way it faces.
 
 Source: the pre-filtered voxels of Crassin et al. 2011, "Interactive Indirect Illumination Using Voxel Cone
-Tracing", without octree: what cones (`cones`) read lies within a small box, so each level is a plain array, of whose
-pages only those are kept that have something in them. (The operating system's pages would do, but they are thirty times
-as large or more, and to have them cleared took most of the time of a small mesh.)
+Tracing", without octree: what cones (`cones`) read lies within a small box, so each level is a plain array of bits that
+say where something is, and only those voxels are kept. (Fresh memory takes longer than what is done with it, on a small
+mesh.)
 
 Lengths are in units of the longest side of what is baked, from just below the low corner of its box.
 """
@@ -24,26 +24,52 @@ _DENSITY = 1.5    # samples of a surface for each face of a voxel that it would 
 # wall that lay on a border of voxels would be on either side of it as floats are rounded
 _SHIFT = 0.37
 _GOLDEN = np.uint32(2654435769)  # the golden ratio's fraction, of 2**32
-_PAGE = 3         # bits of the index that count within a page
+_WORD = 6         # bits of the index that count within a word
+_PAIRS, _FOURS, _BYTES, _SUM = (np.uint64(int(8 * byte, 16)) for byte in ("55", "33", "0f", "01"))
 
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """The voxels of one size, as far as they are read."""
+    """The voxels of one size, as far as they are read. Few have something in them, and only those are kept."""
 
     # (n,) four float32 each: the area a in the voxel, in its faces, as a / (1 + a), and the sum of area times normal,
     # over 1 + a, too. One item of 16 bytes, because NumPy gathers items faster than rows.
     voxels: NDArray[np.complex128]
-    pages: NDArray[np.int32]  # of each eight of the shape's voxels, the index of the first; 0 where all are empty
+    words: NDArray[np.uint64]  # which of each 64 of the shape's voxels, laid out flat, are kept: the lowest bit first
+    first: NDArray[np.int32]   # of those of each word, the index of the first
     shape: tuple[int, int, int]
-    low: NDArray[np.float64]  # (3,) index of the first voxel, counted from the low corner of what is baked
-    size: float               # side of a voxel
+    low: NDArray[np.float64]   # (3,) index of the first voxel, counted from the low corner of what is baked
+    size: float                # side of a voxel
+
+    def filled(self, index: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Whether there is something in the voxels at places of the shape, laid out flat; (n,) each."""
+        bits = self.words.view(np.uint8).take(index >> 3, mode="clip")
+        within = index.astype(np.uint8)
+        within &= 7
+        bits >>= within
+        bits &= 1
+        return bits.view(bool)
 
     def at(self, index: NDArray[np.int32]) -> NDArray[np.complex128]:
-        """The voxels at places of the shape, laid out flat; (n,) each."""
-        first = self.pages.take(index >> _PAGE, mode="clip")
-        first += index & ((1 << _PAGE) - 1)
-        return self.voxels.take(first, mode="clip")
+        """The voxels at places that are `filled`."""
+        return self.voxels.take(_rank(self.words, self.first, index), mode="clip")
+
+
+def _rank(words: NDArray[np.uint64], first: NDArray[np.int32], index: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Which of the kept voxels those at places are: how many bits are set before (Jacobson 1989, "Space-efficient
+    static trees and graphs"), those within a word being counted as everywhere (Warren, "Hacker's Delight", 5-1).
+    """
+    word = (index >> _WORD).astype(np.intp)
+    below = np.uint64(1) << (index & ((1 << _WORD) - 1)).astype(np.uint64)
+    below -= np.uint64(1)
+    below &= words.take(word, mode="clip")
+    below -= (below >> np.uint64(1)) & _PAIRS
+    below = (below & _FOURS) + ((below >> np.uint64(2)) & _FOURS)
+    below += below >> np.uint64(4)
+    below &= _BYTES
+    below *= _SUM
+    below >>= np.uint64(56)
+    return first.take(word, mode="clip") + below.view(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,34 +202,39 @@ def _levels(places: NDArray[np.float32], values: NDArray[np.float32], box: NDArr
             cells, sums = _joined([cells, here.astype(np.int32)]), _joined([sums, value])
         x, y, z = shape.tolist()
         index = (cells[0] * np.int32(y) + cells[1]) * np.int32(z) + cells[2]
-        index = index.astype(np.intp)
-        page = index >> _PAGE
-        filled = np.zeros((x * y * z >> _PAGE) + 1, bool)
-        filled[page] = True
-        full = np.flatnonzero(filled).astype(np.int32)
-        pages = np.zeros(len(filled), np.int32)
-        pages[full] = np.arange(1, len(full) + 1, dtype=np.int32) << _PAGE
-        index &= (1 << _PAGE) - 1
-        index += pages.take(page)
-        filled = np.zeros((len(full) + 1) << _PAGE, bool)
-        filled[index] = True
-        at = np.flatnonzero(filled)
-        rank = np.empty(len(filled), np.intp)
-        rank[at] = np.arange(len(at))
-        index = rank.take(index)
-        part, sums = sums, np.empty((4, len(at)), np.float32)
+        words, first, at = _kept(index, x * y * z)
+        index = _rank(words, first, index)
+        part, sums = sums, np.zeros((4, len(at)), np.float32)
         for total, value in zip(sums, part, strict=True):
-            total[:] = np.bincount(index, value, len(at))
+            np.add.at(total, index, value)
         found, scale = np.empty((len(at), 4), np.float32), np.float32(1 / size ** 2)
         scale = scale / (1 + sums[0] * scale)
         for column, total in zip(found.T, sums, strict=True):
             np.multiply(total, scale, out=column)
-        voxels = np.zeros(len(filled), np.complex128)
-        voxels[at] = found.view(np.complex128)[:, 0]
-        out.append(Level(voxels, pages, (x, y, z), np.full(3, float(low)), size))
-        index = (full.take((at >> _PAGE) - 1) << _PAGE) + (at & ((1 << _PAGE) - 1)).astype(np.int32)
-        column = index // np.int32(z)
+        out.append(Level(found.view(np.complex128)[:, 0], words, first, (x, y, z), np.full(3, float(low)), size))
+        column = at // np.int32(z)
         row = column // np.int32(y)
-        cells = np.stack([row, column - row * np.int32(y), index - column * np.int32(z)])
+        cells = np.stack([row, column - row * np.int32(y), at - column * np.int32(z)])
         cells = (cells + low) >> 1
     return out
+
+
+def _kept(index: NDArray[np.int32], count: int) -> tuple[NDArray[np.uint64], NDArray[np.int32], NDArray[np.int32]]:
+    """`Level`'s words and firsts for voxels at places (m,), of `count`; and the places (n,), each once, rising."""
+    word = index >> _WORD
+    filled = np.zeros((count >> _WORD) + 1, bool)
+    filled[word] = True
+    full = np.flatnonzero(filled).astype(np.int32)
+    number = np.zeros(len(filled), np.int32)
+    number[full] = np.arange(len(full), dtype=np.int32) << _WORD
+    bits = np.zeros(len(full) << _WORD, bool)  # of full words alone, as the whole shape is large
+    word = number.take(word)
+    word += index & ((1 << _WORD) - 1)
+    bits[word] = True
+    at = np.flatnonzero(bits).astype(np.int32)
+    words, first = np.zeros(len(filled), np.uint64), np.zeros(len(filled), np.int32)
+    words[full] = np.packbits(bits, bitorder="little").view(np.uint64)
+    of = at >> _WORD
+    many = np.bincount(of, minlength=len(full))
+    first[full] = np.cumsum(many) - many
+    return words, first, (full.take(of) << _WORD) + (at & ((1 << _WORD) - 1))

@@ -77,7 +77,7 @@ class NEURAL_GASH_OT_show_confidence(Baking, bpy.types.Operator):
             raise UserError(f"Confidence is for bakes to vertices without bounces, which that of '{obj.name}' is not.")
         check_errors(obj)
         depsgraph = context.evaluated_depsgraph_get()
-        if not staleness.same(obj, record):
+        if not staleness.same(obj, record, depsgraph):
             raise UserError(f"'{obj.name}' has changed since the bake; bake it first.")
         read = read_object(obj, depsgraph)
         values, _ = read_transfer(obj)

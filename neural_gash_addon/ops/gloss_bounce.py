@@ -82,7 +82,7 @@ class NEURAL_GASH_OT_bake_gloss(Baking, bpy.types.Operator):
         record = read_record(obj)
         if not can_gloss(record):
             raise UserError("Glossy bounces need a bake to a texture, without bounces and lamps; bake one first.")
-        if not staleness.same(obj, record):
+        if not staleness.same(obj, record, context.evaluated_depsgraph_get()):
             raise UserError(f"'{obj.name}' or what shadows it was changed since its bake; bake it again first.")
         if np.abs(turn_since(obj, record) - np.eye(3)).max() > _TURNED:
             raise UserError(f"'{obj.name}' was turned since its bake; bake it again first.")
@@ -101,7 +101,7 @@ class NEURAL_GASH_OT_bake_gloss(Baking, bpy.types.Operator):
         obj = next((o for o in bpy.data.objects if o.session_uid == job.uid), None)
         if obj is None:
             raise UserError(f"'{job.names[0]}' was deleted while it was being baked.")
-        if read_record(obj) != job.record or not staleness.same(obj, job.record):
+        if read_record(obj) != job.record or not staleness.same(obj, job.record, context.evaluated_depsgraph_get()):
             raise UserError(f"'{obj.name}' or what shadows it was changed during the bake; bake again.")
         images = bake_images(obj.data, job.record)
         half = images[0].use_half_precision and all(np.abs(c).max() < _MOST_HALF for c in transfer.coefficients)

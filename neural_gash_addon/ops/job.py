@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from ..backend import methods
 from ..backend.atlas import Part, check_area, check_part
-from ..backend.bounce import Reflection
 from ..backend.errors import UserError
 from ..backend.exchange import check_folder
 from ..backend.geometry import Surface
@@ -27,10 +26,10 @@ from ..backend.texture import TextureTransfer, remove_tiles
 from ..backend.texture import bake as bake_texture
 from ..backend.transfer import Transfer
 from ..properties import COLLECTION, DENSITY, FIT, TEXTURE, NeuralGashSettings
-from ..scene.attributes import attribute_count, read_record, write_textures, write_transfer
+from ..scene.attributes import read_record, write_textures, write_transfer
 from ..scene.lighting import apply_light, take_light
 from ..scene.normal_maps import read_normal_maps
-from ..scene.preview import EEVEE_ATTRIBUTES, preview_off, preview_on
+from ..scene.preview import preview_off, preview_on
 from ..scene.read import (
     SELF,
     VISIBLE,
@@ -38,12 +37,12 @@ from ..scene.read import (
     fingerprint,
     group_mode,
     is_group,
-    read_finish,
     read_object,
     read_occluders,
     refusal,
     same_fingerprint,
 )
+from ..scene.reflection import check_attributes, read_reflection
 from ..scene.uv_maps import check_room, read_uv
 from .lamps import LampReader
 
@@ -96,11 +95,9 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
     quality = settings.tracing()
     reflection = None
     if method.traces and settings.bounces:
-        if settings.target != TEXTURE and attribute_count(3 * settings.order ** 2) > EEVEE_ATTRIBUTES:
-            raise UserError(f"With bounces, an order-{settings.order} bake takes more than the {EEVEE_ATTRIBUTES} "
-                            "attributes that EEVEE draws; choose order 4 or less, or bake to a texture.")
-        finish, pictures = read_finish(obj, mode, depsgraph)
-        reflection = Reflection(finish[:, :3], settings.bounces, pictures)
+        if settings.target != TEXTURE:
+            check_attributes(settings.order)
+        reflection = read_reflection(obj, mode, depsgraph, settings.bounces)
     occluders = read_occluders(obj, mode, depsgraph)
     lit = lamps.of(obj) if lamps is not None else None
     bake: Callable[..., Generator[float, None, Transfer | TextureTransfer]]

@@ -173,8 +173,10 @@ def _folder(chosen: str) -> Path:
 
 
 def _file(folder: Path, obj: bpy.types.Object) -> Path:
-    """The file of an object's sequence."""
-    return folder / f"{bpy.path.clean_name(obj.name)}{SUFFIX}"
+    """The file of an object's sequence: of this .blend, so that another with such an object has its own."""
+    blend = Path(bpy.data.filepath).stem
+    name = bpy.path.clean_name(obj.name)
+    return folder / f"{f'{bpy.path.clean_name(blend)}-' if blend else ''}{name}{SUFFIX}"
 
 
 class NEURAL_GASH_OT_bake_sequence(Baking, bpy.types.Operator):

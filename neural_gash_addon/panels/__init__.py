@@ -127,7 +127,7 @@ class NEURAL_GASH_PT_light(_Panel, bpy.types.Panel):
             layout.operator("neural_gash.read_light", icon="FILE_REFRESH")
         if problem(context.scene):
             _paragraph(layout.column(align=True), problem(context.scene), "ERROR")
-        layout.prop(settings, "light_rotation")
+        layout.prop(settings, "light_rotation", slider=True)
         layout.prop(settings, "with_viewport")
         layout.prop(settings, "light_strength")
         obj = context.object

@@ -10,7 +10,6 @@ import time
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import bpy
 from bpy.app.handlers import persistent
@@ -20,14 +19,16 @@ from ..backend.errors import UserError
 from ..backend.geometry import TEXEL, TriangleMesh
 from ..backend.live import Live, LivePlan, best
 from ..backend.record import BakeRecord
-from ..backend.sequence import Sequence, open_sequence
 from ..backend.transfer import Transfer
+from . import rendered as renders
 from .attributes import SEQUENCE, has_bake, read_record, write_transfer
 from .deforming import Deforming
 from .evaluation import shown_objects
 from .frames import rotation_part
 from .lighting import light_object
+from .playback import forget_files, show_frame
 from .read import SELF, fingerprint, read_object, read_occluders, refusal, same_fingerprint
+from .reflection import check_attributes, read_reflection
 
 _BESIDES = 0.15  # of the budget, for reading and writing, before any update has been timed
 _NEWEST = 0.2    # weight of the newest update in how slow updates are
@@ -51,7 +52,6 @@ class _Follower:
 
 _followers: dict[int, _Follower] = {}        # by session uid of the object
 _problems: dict[int, str] = {}               # why an object is not followed
-_sequences: dict[str, tuple[float, Sequence]] = {}  # path -> when the file was written, and the file
 _shown: dict[int, frozenset[int]] = {}       # session uid of a scene -> its objects that are shown, when last looked at
 _LIVE = "Live."  # with which the plan of a bake begins that was made within the budget
 _suspended = False                           # something else bakes frame by frame
@@ -149,7 +149,7 @@ def _followed(scene: bpy.types.Scene, rendered: bool) -> list[bpy.types.Object]:
     return list(found.values())
 
 
-def _followable(obj: bpy.types.Object) -> BakeRecord:
+def _followable(obj: bpy.types.Object, rendered: bool = False) -> BakeRecord:
     """The record of a bake that can be made again and again. Raises UserError where it cannot."""
     reason = refusal(obj)
     if reason:
@@ -159,16 +159,16 @@ def _followable(obj: bpy.types.Object) -> BakeRecord:
         raise UserError(f"'{obj.name}' is baked to a texture; live updates are for bakes to vertices.")
     if record.lamps:
         raise UserError(f"Lamps light the bake of '{obj.name}'; live updates are for bakes without lamps.")
-    if record.colours != 1:
-        raise UserError(f"Light bounces in the bake of '{obj.name}'; live updates are for bakes without bounces.")
+    if record.colours != 1 and not rendered:
+        raise UserError(f"Light bounces in the bake of '{obj.name}'; it is followed in rendered frames only.")
     return record
 
 
 def _update(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, rendered: bool) -> bool:
     """Bake an object again, if it is no longer as it was baked. Raises UserError."""
-    before = _followable(obj)
+    before = _followable(obj, rendered)
     began = time.perf_counter()
-    now = fingerprint(obj, depsgraph, before.occluders)
+    now = fingerprint(obj, depsgraph, before.occluders, bounces=before.colours == 3)
     hurried = before.plan.startswith(_LIVE)  # by an update in the window
     if same_fingerprint(now, before.fingerprint) and not (rendered and hurried):
         return False
@@ -176,14 +176,12 @@ def _update(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types.
     if rendered:
         read = read_object(obj, depsgraph)
         mesh, matrix = read.mesh, read.matrix
+        transfer = _as_bake(scene, obj, depsgraph, before, mesh)
+        if transfer.record.colours != before.colours:
+            now = fingerprint(obj, depsgraph, before.occluders, bounces=transfer.record.colours == 3)
     else:
         mesh, matrix = follower.reader.read(obj, depsgraph)
-    occluders = read_occluders(obj, before.occluders, depsgraph)
-    if rendered:
-        settings = scene.neural_gash
-        transfer = methods.run(methods.bake(mesh, settings.method, before.order, occluders=occluders,
-                                            **settings.tracing()))
-    else:
+        occluders = read_occluders(obj, before.occluders, depsgraph)
         plan = _plan(scene, follower, mesh, occluders, before.order)
         assert follower.live is not None
         reading = time.perf_counter() - began
@@ -197,12 +195,25 @@ def _update(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types.
     frame = tuple(float(v) for v in rotation_part(matrix).ravel())
     record = replace(transfer.record, occluders=before.occluders, fingerprint=now, frame=frame)
     write_transfer(obj, mesh.elements, replace(transfer, record=record))
-    if frame != before.frame:
+    if frame != before.frame or record.colours != before.colours:
         light_object(scene, obj)
     follower.seconds = time.perf_counter() - began
     if not rendered:
         _adapt(follower, baked)
     return True
+
+
+def _as_bake(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, before: BakeRecord,
+             mesh: TriangleMesh) -> Transfer:
+    """What the settings give, at the order and with the occluders of the bake before. Raises UserError."""
+    settings = scene.neural_gash
+    bounces = settings.bounces or before.bounces
+    reflection = None
+    if bounces and methods.METHODS[settings.method].traces:
+        check_attributes(before.order)
+        reflection = read_reflection(obj, before.occluders, depsgraph, bounces)
+    return methods.run(methods.bake(mesh, settings.method, before.order, reflection=reflection,
+                                    occluders=read_occluders(obj, before.occluders, depsgraph), **settings.tracing()))
 
 
 def _plan(scene: bpy.types.Scene, follower: _Follower, mesh: TriangleMesh, occluders: list, order: int) -> LivePlan:
@@ -258,39 +269,12 @@ def play(scene: bpy.types.Scene) -> list[bpy.types.Object]:
             continue
         shown.add(obj.data.session_uid)
         try:
-            if _show_frame(scene, obj):
+            if show_frame(scene, obj):
                 written.append(obj)
             _problems.pop(obj.session_uid, None)
         except UserError as error:
             _problems[obj.session_uid] = str(error)
     return written
-
-
-def _show_frame(scene: bpy.types.Scene, obj: bpy.types.Object) -> bool:
-    """Write the current frame of a sequence to its object, if it is another. Raises UserError."""
-    before = read_record(obj)
-    sequence = _sequence(str(obj.data[SEQUENCE]))
-    coefficients, record = sequence.frame(scene.frame_current)
-    if same_fingerprint(record.fingerprint, before.fingerprint):
-        return False
-    name = obj.data[SEQUENCE]
-    write_transfer(obj, sequence.elements, Transfer(coefficients, record))
-    obj.data[SEQUENCE] = name
-    if record.frame != before.frame:
-        light_object(scene, obj)
-    return True
-
-
-def _sequence(name: str) -> Sequence:
-    """The file that a mesh names, mapped once. Raises UserError."""
-    path = Path(bpy.path.abspath(name))
-    try:
-        written = path.stat().st_mtime
-    except OSError as error:
-        raise UserError(f"The sequence '{path}' is missing; bake it again, or clear the bake.") from error
-    if name not in _sequences or _sequences[name][0] != written:
-        _sequences[name] = written, open_sequence(path)
-    return _sequences[name][1]
 
 
 @persistent
@@ -314,6 +298,8 @@ def _on_frame(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Follow what is animated, before it is drawn or rendered."""
     if not _suspended:
         written = play(scene) + follow(scene, depsgraph, bpy.app.background or _rendering)
+        if _rendering:
+            renders.show_what_fits(scene, depsgraph, _problems)
         _animate_again(scene, written)
 
 
@@ -321,7 +307,8 @@ def _on_frame(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
 def _on_load(*_: object) -> None:
     """Another file: nothing known holds."""
     forget()
-    _sequences.clear()
+    forget_files()
+    renders.forget()
 
 
 @persistent
@@ -336,6 +323,10 @@ def _on_rendered(*_: object) -> None:
     """It ended, however."""
     global _rendering
     _rendering = False
+    if bpy.app.background:
+        renders.show_all()
+    elif not bpy.app.timers.is_registered(renders.show_all):
+        bpy.app.timers.register(renders.show_all)  # renders of a window end in a thread of their own
 
 
 _HANDLERS = (("depsgraph_update_post", _on_update), ("frame_change_post", _on_frame), ("load_post", _on_load),
@@ -350,7 +341,11 @@ def register() -> None:
 
 def unregister() -> None:
     """Stop, and forget."""
+    global _rendering
     for name, handler in _HANDLERS:
         getattr(bpy.app.handlers, name).remove(handler)
+    if bpy.app.timers.is_registered(renders.show_all):
+        bpy.app.timers.unregister(renders.show_all)
+    renders.show_all()
     _on_load()
-    _on_rendered()
+    _rendering = False

@@ -42,26 +42,28 @@ def status(obj: bpy.types.Object | None) -> str:
 
 def check(obj: bpy.types.Object) -> bool:
     """Compare the object with its bake now: whether the bake still fits. Main thread only."""
-    try:
-        record = read_record(obj)
-        current = same(obj, record) and _gloss_fits(obj, record)
-        check_whole(obj.data, record)
-    except UserError:  # changed so far that it could not be baked again as it was
-        current = False
+    current = fits(obj, bpy.context.evaluated_depsgraph_get())
     _known[obj.session_uid] = CURRENT if current else STALE
     _changed.discard(obj.session_uid)
     return current
 
 
-def same(obj: bpy.types.Object, record: BakeRecord) -> bool:
+def fits(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
+    """Whether the bake of an object is whole, and of the object as it stands evaluated."""
+    try:
+        record = read_record(obj)
+        check_whole(obj.data, record)
+        return same(obj, record, depsgraph) and _gloss_fits(obj, record, depsgraph)
+    except UserError:  # changed so far that it could not be baked again as it was
+        return False
+
+
+def same(obj: bpy.types.Object, record: BakeRecord, depsgraph: bpy.types.Depsgraph) -> bool:
     """Whether the object's shape, what shadows it and lamps are those of a bake. Raises UserError, as `fingerprint`."""
     uv = read_uv(obj.data, record.uv_map) if record.uv_map else None
-    now = fingerprint(obj, bpy.context.evaluated_depsgraph_get(), record.occluders, uv, record.colours == 3)
-    return same_fingerprint(now, record.fingerprint) and (not record.lamps or _lamps_key(obj) == record.lamps)
-
-
-def _lamps_key(obj: bpy.types.Object) -> str:
-    return read_lamps(obj, bpy.context.evaluated_depsgraph_get())[1]
+    now = fingerprint(obj, depsgraph, record.occluders, uv, record.colours == 3)
+    return (same_fingerprint(now, record.fingerprint)
+            and (not record.lamps or read_lamps(obj, depsgraph)[1] == record.lamps))
 
 
 def register() -> None:
@@ -148,10 +150,10 @@ def _compare_changed() -> None:
                 area.tag_redraw()
 
 
-def _gloss_fits(obj: bpy.types.Object, record: BakeRecord) -> bool:
+def _gloss_fits(obj: bpy.types.Object, record: BakeRecord, depsgraph: bpy.types.Depsgraph) -> bool:
     """Whether the glossy bounces, if there are any, are of the materials as they are."""
     return not has_bounces(obj.data) or finish_fits(
-        obj.data, finish_key(*read_finish(obj, record.occluders, bpy.context.evaluated_depsgraph_get())))
+        obj.data, finish_key(*read_finish(obj, record.occluders, depsgraph)))
 
 
 def _reflects(obj: bpy.types.Object) -> bool:

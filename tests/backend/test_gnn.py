@@ -50,10 +50,13 @@ def test_numpy_is_the_torch_module_that_was_trained():
     model = Net()
     for parameter in model.parameters():
         torch.nn.init.normal_(parameter, std=0.1)
-    seen = np.random.default_rng(0).random((cones.STEPS * cones.CHANNELS, 25, 700), np.float32)
-    with torch.no_grad():
-        expected = model(torch.from_numpy(seen)).numpy()
-    np.testing.assert_allclose(gnn.answer(seen, model.network()), expected, atol=1e-5)
+    rng = np.random.default_rng(0)
+    for share in (0.0, 0.4, 1.0):  # of cones that see something
+        some = np.flatnonzero(rng.random(25 * 700) < share)
+        seen = cones.Seen(700, some, rng.random((cones.STEPS * cones.CHANNELS, len(some)), np.float32))
+        with torch.no_grad():
+            expected = model(torch.from_numpy(seen.dense())).numpy()
+        np.testing.assert_allclose(gnn.answer(seen, model.network()), expected, atol=1e-5)
 
 
 def test_it_sees_most_of_the_shadows(case):

@@ -14,8 +14,12 @@ MIXED = [shapes.torus(), shapes.cube(subdivisions=0), shapes.grid(2)]
 
 
 def dense(level):
-    """(x, y, z, 4) all of a level's voxels, without pages."""
-    return level.at(np.arange(np.prod(level.shape), dtype=np.int32)).view(np.float32).reshape(*level.shape, 4)
+    """(x, y, z, 4) all of a level's voxels, kept or not."""
+    every = np.arange(np.prod(level.shape), dtype=np.int32)
+    some = np.flatnonzero(level.filled(every))
+    out = np.zeros((len(every), 4), np.float32)
+    out[some] = level.at(every[some]).view(np.float32).reshape(-1, 4)
+    return out.reshape(*level.shape, 4)
 
 
 def opened(level):
@@ -97,12 +101,14 @@ def test_voxels_hold_what_the_slow_twin_puts_in_them(geometry, monkeypatch):
         assert differ.sum() <= 3e-3 * len(slow)  # where float32 rounds a sample across a border
 
 
-def test_pages_without_anything_in_them_are_not_kept():
+def test_only_voxels_with_something_in_them_are_kept_and_each_is_found():
     for level in cones.pyramid([shapes.torus()]).levels:
-        pages = level.voxels.reshape(-1, 8)
-        assert not pages[0].any()
-        assert pages[1:].any(1).all()
-        assert sorted(level.pages[level.pages > 0]) == list(range(8, len(level.voxels), 8))
+        kept = np.flatnonzero(np.unpackbits(level.words.view(np.uint8), bitorder="little")).astype(np.int32)
+        assert len(level.voxels) == len(kept)
+        assert (level.voxels.view(np.float32).reshape(-1, 4)[:, 0] > 0).all()
+        assert level.filled(kept).all()
+        assert not level.filled(np.setdiff1d(np.arange(np.prod(level.shape), dtype=np.int32), kept)).any()
+        np.testing.assert_array_equal(level.at(kept), level.voxels)
 
 
 def read_slowly(geometry, point, normal, frame):
@@ -125,7 +131,7 @@ def test_cones_read_what_the_slow_twin_reads():
     geometry = [shapes.torus()]
     mesh = shapes.at_points(geometry[0], geometry[0][0][::40], Rotation.random(13, random_state=1).as_matrix()[:, :, 0])
     frames = gnn.frames_of(mesh.normals, over=False)
-    seen = cones.read(cones.pyramid(geometry), mesh.points, mesh.normals, frames)
+    seen = cones.read(cones.pyramid(geometry), mesh.points, mesh.normals, frames).dense()
     for i in range(len(mesh.points)):
         slow = read_slowly(geometry, mesh.points[i], mesh.normals[i], frames[i])
         differ = np.abs(seen[:, :, i] - slow) > 1e-5
@@ -136,11 +142,11 @@ def test_what_is_seen_does_not_depend_on_size_place_or_order_of_the_triangles():
     positions, triangles = shapes.torus()
     mesh = shapes.at_points((positions, triangles), positions[:50], positions[:50] / np.linalg.norm(positions[:50]))
     frames = gnn.frames_of(mesh.normals, over=False)
-    first = cones.read(cones.pyramid([(positions, triangles)]), mesh.points, mesh.normals, frames)
+    first = cones.read(cones.pyramid([(positions, triangles)]), mesh.points, mesh.normals, frames).dense()
     mixed = np.random.default_rng(0).permutation(triangles)
     for scale, move in ((1e-3, 0.0), (1e3, 0.0), (1.0, 1e3)):
         moved = positions * scale + move
-        again = cones.read(cones.pyramid([(moved, mixed)]), moved[:50], mesh.normals, frames)
+        again = cones.read(cones.pyramid([(moved, mixed)]), moved[:50], mesh.normals, frames).dense()
         assert (np.abs(again - first) > 1e-4).mean() < 1e-3
 
 
@@ -155,7 +161,7 @@ def test_a_wide_floor_costs_no_more_than_a_near_one():
         filled.append(sum(np.count_nonzero(level.voxels) for level in voxels.levels))
         # under the ball the floor is as fine as the ball is
         below = cones.read(voxels, np.array([[0, 0, -0.98]]), np.array([[0, 0, -1.0]]),
-                           gnn.frames_of(np.array([[0, 0, -1.0]]), over=False))
+                           gnn.frames_of(np.array([[0, 0, -1.0]]), over=False)).dense()
         assert below[0].max() > 0.2
     assert filled[1] < 1.5 * filled[0]
 
@@ -166,9 +172,9 @@ def test_what_is_farther_than_the_last_step_is_still_seen():
         shell = shapes.sphere(2)
         voxels = cones.pyramid([ball, (shell[0] * radius, shell[1])])
         normal = np.array([[0.0, 0.0, 1.0]])
-        seen = cones.read(voxels, normal, normal, gnn.frames_of(normal, over=False))
+        seen = cones.read(voxels, normal, normal, gnn.frames_of(normal, over=False)).dense()
         assert (seen[-cones.CHANNELS] > 0).all()  # in every direction, be it a corner of a voxel
-    alone = cones.read(cones.pyramid([ball]), normal, normal, gnn.frames_of(normal, over=False))
+    alone = cones.read(cones.pyramid([ball]), normal, normal, gnn.frames_of(normal, over=False)).dense()
     assert alone[-cones.CHANNELS].max() == 0
 
 
@@ -181,7 +187,7 @@ def test_what_is_farther_than_the_last_step_is_still_seen():
 def test_degenerate_surfaces_give_finite_voxels(geometry):
     voxels = cones.pyramid([geometry])
     normal = np.array([[0.0, 0.0, 1.0]])
-    seen = cones.read(voxels, geometry[0][:1], normal, gnn.frames_of(normal, over=False))
+    seen = cones.read(voxels, geometry[0][:1], normal, gnn.frames_of(normal, over=False)).dense()
     assert np.isfinite(seen).all() and np.abs(seen).max() <= 1
 
 

@@ -87,3 +87,24 @@ def snapshot():
                  for kind in ("objects", "meshes", "materials", "node_groups", "scenes", "images", "collections")}
         return repr((meshes, objects, active and active.name, names, "neural_gash_light" in bpy.context.scene))
     return take
+
+
+@pytest.fixture
+def wing(make, settings):
+    """A sheet that folds up by a shape key, from frame 1 to frame 10; baked, at frame 1."""
+    import bpy
+    line = np.linspace(-1, 1, 25)
+    positions = [(x, y, 0) for y in line for x in line]
+    faces = [(j * 25 + i, j * 25 + i + 1, (j + 1) * 25 + i + 1, (j + 1) * 25 + i) for j in range(24) for i in range(24)]
+    obj = make(positions, faces, "Wing", smooth=True)
+    obj.shape_key_add(name="Basis")
+    key = obj.shape_key_add(name="Up")
+    for point, (x, y, _) in zip(key.data, positions, strict=True):
+        point.co = (0.35 * x, y, 0.9 * x) if x > 0 else (x, y, 0)
+    for frame, value in ((1, 0.0), (10, 1.0)):
+        key.value = value
+        key.keyframe_insert("value", frame=frame)
+    bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 4
+    bpy.context.scene.frame_set(1)
+    assert bpy.ops.neural_gash.bake() == {"FINISHED"}
+    return obj

@@ -239,6 +239,29 @@ def test_a_problem_stays_said_while_others_change(sheet, make, settings):
     assert "change its vertices" in live.problem(obj)
 
 
+@pytest.mark.parametrize("where", ["fingerprint", "write_transfer"])
+def test_a_frame_change_during_an_update(sheet, settings, monkeypatch, capfd, where):
+    """By another add-on's handler or a script: before anything was read, and before it is written."""
+    obj = sheet()
+    bake(obj)
+    settings.live = True
+    real, again = getattr(live, where), []
+
+    def busy(*args, **kwargs):
+        if not again:
+            again.append(bpy.context.scene.frame_current)
+            bpy.context.scene.frame_set(3)
+        return real(*args, **kwargs)
+    monkeypatch.setattr(live, where, busy)
+    bpy.context.scene.frame_set(2)
+    assert again == [2] and bpy.context.scene.frame_current == 3
+    monkeypatch.setattr(live, where, real)
+    bpy.context.scene.frame_set(3)
+    np.testing.assert_allclose(stored(obj), truth(obj, settings), atol=1e-6)
+    assert staleness.status(obj) == staleness.CURRENT and not live.problem(obj)
+    quiet(capfd)
+
+
 def test_live_switched_on_during_a_sequence(sheet, settings, tmp_path):
     obj = sheet()
     bake(obj)
@@ -275,6 +298,41 @@ def test_colliding_names(sheet, settings, tmp_path):
     bpy.ops.neural_gash.bake_sequence()
     files = [obj.data.get("neural_gash_sequence") for obj in (one, two)]
     assert files[0] != files[1] or files[1] is None
+
+
+def test_each_blend_has_its_own(sheet, settings, tmp_path):
+    """Two files with objects of the same name, sequences in the same folder."""
+    scene = bpy.context.scene
+    select(sheet())
+    settings.sequence_folder = "//"
+    for name in ("one", "two"):
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / f"{name}.blend"))
+        scene = bpy.context.scene
+        scene.frame_end = 1 if name == "two" else 3
+        bpy.context.view_layer.objects.active = bpy.data.objects["Sheet"]
+        assert bpy.ops.neural_gash.bake_sequence() == {"FINISHED"}
+        bpy.ops.wm.save_mainfile()
+    assert sorted(path.name for path in tmp_path.glob("*.prtseq")) == ["one-Sheet.prtseq", "two-Sheet.prtseq"]
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "one.blend"))
+    bpy.context.scene.frame_set(3)
+    assert staleness.status(bpy.data.objects["Sheet"]) == staleness.CURRENT
+
+
+def test_disabled_during_a_sequence(sheet, settings, tmp_path, addon, capfd):
+    """Nothing is left of it: no file, and the scene at its frame."""
+    obj = sheet()
+    settings.sequence_folder = str(tmp_path)
+    bpy.context.scene.frame_set(2)
+    baking = bake_sequence(bpy.context, [obj])
+    while next(baking) < 0.5:
+        pass
+    addon.unregister()
+    try:
+        baking.close()
+        assert not list(tmp_path.iterdir()) and bpy.context.scene.frame_current == 2 and not live._suspended
+    finally:
+        addon.register()
+    quiet(capfd)
 
 
 def test_twins(sheet, settings, tmp_path):

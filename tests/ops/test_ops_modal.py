@@ -193,6 +193,35 @@ def test_another_file_meanwhile(make, settings, operator, context):
     assert "Lost" in operator.reports[0][1] and "neural_gash" not in bpy.data.objects["Other"].data
 
 
+def test_saved_meanwhile(make, settings, operator, context, tmp_path):
+    """The file has no part of the bake; the bake ends as ever."""
+    make()
+    operator.invoke(context, None)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"))
+    assert _to_the_end(operator, context) == {"FINISHED"} and context.idle
+    assert "neural_gash" in bpy.data.objects["Thing"].data
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "saved.blend"))
+    data = bpy.data.objects["Thing"].data
+    assert "neural_gash" not in data and not any(name.startswith("_prt_") for name, _ in data.attributes.items())
+
+
+@pytest.mark.parametrize("what", ["moved", "edited"])
+def test_undone_meanwhile(make, settings, operator, context, what):
+    """What was undone moved the object, which changes no bake, or its vertices, which does."""
+    obj = make()
+    bpy.ops.ed.undo_push(message="made")
+    if what == "moved":
+        obj.location.x = 3
+    else:
+        obj.data.vertices[0].co.x += 0.5
+    bpy.ops.ed.undo_push(message=what)
+    operator.invoke(context, None)
+    bpy.ops.ed.undo()
+    assert _to_the_end(operator, context) == ({"FINISHED"} if what == "moved" else {"CANCELLED"})
+    assert context.idle and len(operator.reports) == 1
+    assert ("neural_gash" in bpy.data.objects["Thing"].data) == (what == "moved")
+
+
 def test_a_failing_worker_is_reported(make, settings, operator, context, monkeypatch, snapshot):
     from neural_gash_addon.backend import methods
 

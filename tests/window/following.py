@@ -6,7 +6,9 @@ Part of `session.py`, whose names are handed over as `s`.
 from __future__ import annotations
 
 import sys
+import tempfile
 import time
+from pathlib import Path
 
 import bpy
 import numpy as np
@@ -97,6 +99,7 @@ def lived(s):
         bpy.ops.screen.animation_cancel()
     s.facts["live_frames_seen"] = len(seen)
     s.expect(len(seen) > 2, "live_follows_playback")  # software GL draws few frames a second
+    yield from rendered(s, head)
     s.settings().live = False
     head.modifiers.remove(twist)
     head.animation_data_clear()
@@ -105,3 +108,57 @@ def lived(s):
         bpy.ops.ed.undo_push(message="Live over")
     s.expect(bpy.ops.neural_gash.bake() == {"FINISHED"}, "baked_after_live")
     yield 0.5
+
+
+def rendered(s, head):
+    """An animation rendered from the open window, whose second frame cannot be followed: own materials there only."""
+    scene, live = bpy.context.scene, sys.modules[f"{s.ID}.scene.live"]
+    aside = sys.modules[f"{s.ID}.scene.rendered"]
+    more = head.modifiers.new("More", "SUBSURF")
+    more.levels = more.render_levels = 1
+    for frame, shown in ((1, False), (2, True), (3, False)):
+        more.show_viewport = more.show_render = shown
+        for path in ("show_viewport", "show_render"):
+            more.keyframe_insert(path, frame=frame)
+    frames = scene.frame_start, scene.frame_end
+    scene.frame_start, scene.frame_end = 1, 3
+    scene.frame_set(1)
+    engine, scene.render.engine, scene.cycles.samples = scene.render.engine, "CYCLES", 1
+    locked, scene.render.use_lock_interface = scene.render.use_lock_interface, True
+    scene.render.resolution_x = scene.render.resolution_y = 32
+    kind, scene.render.image_settings.file_format = scene.render.image_settings.file_format, "PNG"
+    materials = []
+
+    def note(*_):
+        materials.append([slot.material and slot.material.name for slot in head.material_slots])
+
+    with tempfile.TemporaryDirectory() as folder:
+        path, scene.render.filepath = scene.render.filepath, str(Path(folder) / "frame")
+        bpy.app.handlers.render_post.append(note)
+        try:
+            with s.in_view():
+                s.expect("RUNNING_MODAL" in bpy.ops.render.render("INVOKE_DEFAULT", animation=True), "render_begins")
+            until = time.perf_counter() + 120
+            while (bpy.app.is_job_running("RENDER") or len(materials) < 3) and time.perf_counter() < until:
+                yield 0.2
+        finally:
+            bpy.app.handlers.render_post.remove(note)
+        s.facts["rendered_materials"] = materials
+        s.expect(len(list(Path(folder).iterdir())) == 3, "three_frames_rendered")
+        scene.render.filepath = path
+    own = ["PRT preview" not in str(names) for names in materials]
+    s.expect(own == [False, True, False], "own_materials_where_it_cannot_follow")
+    yield 1.0
+    for window in bpy.context.window_manager.windows[1:]:  # the picture's
+        with bpy.context.temp_override(window=window):
+            bpy.ops.wm.window_close()
+    yield 0.5
+    slots = [slot.material and slot.material.name for slot in head.material_slots]
+    s.expect("PRT preview" in str(slots) and not aside._aside, "the_preview_is_back")
+    scene.render.use_lock_interface, scene.render.engine = locked, engine
+    scene.render.image_settings.file_format = kind
+    scene.frame_start, scene.frame_end = frames
+    head.modifiers.remove(more)
+    scene.frame_set(1)
+    yield 1.0
+    s.expect(not live.problem(head), "followed_again_after_the_render")

@@ -5,6 +5,9 @@ Part of `session.py`, whose module is handed over as `s`.
 """
 from __future__ import annotations
 
+import inspect
+import sys
+import tempfile
 import threading
 
 import bpy
@@ -14,14 +17,18 @@ def moments(s):
     """All of them."""
     yield from loaded(s)
     yield from closed(s)
-    yield from disabled(s)
+    yield from disabled(s, long_bake)
+    yield from disabled(s, long_sequence)
 
 
 def left_behind(s) -> dict:
-    """Handlers and threads of the add-on, and modal operators of the windows."""
+    """Handlers, timers and threads of the add-on, and modal operators of the windows."""
+    functions = {f for name, module in list(sys.modules.items()) if name.startswith(s.ID)
+                 for f in vars(module).values() if inspect.isfunction(f)}
     handlers = {name: sum(getattr(h, "__module__", "").startswith(s.ID) for h in getattr(bpy.app.handlers, name))
                 for name in dir(bpy.app.handlers) if isinstance(getattr(bpy.app.handlers, name), list)}
     return {"handlers": {name: count for name, count in handlers.items() if count},
+            "timers": sum(map(bpy.app.timers.is_registered, functions)),
             "threads": sum(t.name.startswith("neural_gash") for t in threading.enumerate()),
             # None: of a class that is gone; Blender drops it with the next event
             "modal": sum(op is not None for w in bpy.context.window_manager.windows for op in w.modal_operators)}
@@ -38,6 +45,15 @@ def long_bake(s, window=None) -> None:
         settings = window.scene.neural_gash
         settings.method, settings.quality, settings.rays = "embree", "RAYS", s.MANY_RAYS
         s.expect(bpy.ops.neural_gash.bake("INVOKE_DEFAULT") == {"RUNNING_MODAL"}, "a_long_bake_begins")
+
+
+def long_sequence(s) -> None:
+    """A sequence of the same ball that does not end by itself."""
+    with s.in_view():
+        settings = bpy.context.scene.neural_gash
+        settings.sequence_folder = tempfile.mkdtemp()
+        settings.method, settings.quality, settings.rays = "embree", "RAYS", s.MANY_RAYS
+        s.expect(bpy.ops.neural_gash.bake_sequence("INVOKE_DEFAULT") == {"RUNNING_MODAL"}, "a_long_sequence_begins")
 
 
 def gone(s, name: str):
@@ -76,11 +92,11 @@ def closed(s):
     s.expect(len(bpy.context.window_manager.windows) == 1, "one_window_again")
 
 
-def disabled(s):
+def disabled(s, begin):
     """The add-on is disabled while a bake runs and Live is on, and enabled again."""
     before = left_behind(s)
     bpy.context.scene.neural_gash.live = True
-    long_bake(s)
+    begin(s)
     yield 1.0
     state = s.state()
     bpy.ops.preferences.addon_disable(module=s.ID)
@@ -89,7 +105,8 @@ def disabled(s):
         now = left_behind(s)
         if not (now["threads"] or now["modal"]):
             break
-    s.expect(now == {"handlers": {}, "threads": 0, "modal": 0} and not state.running, "disabling_leaves_nothing")
+    nothing = {"handlers": {}, "timers": 0, "threads": 0, "modal": 0}
+    s.expect(now == nothing and not state.running, "disabling_leaves_nothing")
     bpy.context.object.location.x += 1  # what was followed moves
     bpy.context.scene.frame_set(2)
     yield 1.0

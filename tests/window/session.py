@@ -31,6 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from following import following
 from likeness import LARGEST, differences
 from moments import moments
+from pressing import click, drag
 
 ID = "bl_ext.user_default.neural_gash"
 NAME = "Suzanne"
@@ -67,6 +68,11 @@ def expect(holds: bool, name: str) -> None:
     facts[name] = bool(holds)
     if not holds:
         failures.append(name)
+
+
+def here() -> SimpleNamespace:
+    """This module, for the others."""
+    return SimpleNamespace(**globals())
 
 
 def state():
@@ -187,11 +193,11 @@ def session():
     yield from build()
     yield from cancelled()
     yield from baked()
-    yield from following(SimpleNamespace(**globals()))
+    yield from following(here())
     yield from reopened()
     yield from textured()
     yield from deleted()
-    yield from moments(SimpleNamespace(**globals()))
+    yield from moments(here())
     if pictures is not None and shutil.which("import"):
         facts["differences"] = {name: round(much, 3) for name, much in differences(pictures).items()}
         expect(max(facts["differences"].values()) < LARGEST, "pictures_are_like_the_references")
@@ -248,7 +254,7 @@ def cancelled():
         gaps.append(time.perf_counter() - last)
         last = time.perf_counter()
     facts["bake_largest_gap_s"], facts["bake_mean_gap_s"] = round(max(gaps), 3), round(float(np.mean(gaps)), 4)
-    expect(max(gaps) < GAP_LIMIT, "stays_responsive")
+    expect(max(gaps) < max(GAP_LIMIT, 2 * max(idle)), "stays_responsive")  # also on a machine that is busy otherwise
     facts["progress_after_8_s"] = round(state().progress, 4)
     expect(state().running and 0 < state().progress < 1, "progress_moves")
     yield from picture("2_baking")
@@ -256,7 +262,7 @@ def cancelled():
     press("ESC")
     yield from until_idle(10)
     facts["esc_s"] = round(time.perf_counter() - began, 3)
-    expect(facts["esc_s"] < ESC_LIMIT, "esc_in_time")
+    expect(facts["esc_s"] < max(ESC_LIMIT, 3 * float(np.mean(idle))), "esc_in_time")
     while any(t.name.startswith("neural_gash") for t in threading.enumerate()) and time.perf_counter() - began < 20:
         yield 0.005
     facts["threads_gone_s"] = round(time.perf_counter() - began, 3)
@@ -272,7 +278,13 @@ def baked():
     for turn in ("first", "second"):
         gaps: list[float] = []
         began = time.perf_counter()
-        bake()
+        if turn == "first":
+            bake()
+        else:
+            yield from click(here(), "neural_gash.preset(")
+            yield from click(here(), "neural_gash.bake()")
+            settings().tolerance = 0.02
+        expect(state().running, f"{turn}_bake_begins")
         yield from until_idle(120, gaps)
         facts[f"{turn}_bake_s"] = round(time.perf_counter() - began, 2)
         facts[f"{turn}_bake_largest_gap_s"] = round(max(gaps[:-1]), 3)
@@ -300,13 +312,10 @@ def baked():
     yield from picture("5_material_preview")
     materials = len(bpy.data.materials)
     unturned = light()
-    times = []
-    for angle in np.linspace(0, 2, 9)[1:]:
-        began = time.perf_counter()
-        settings().light_rotation = float(angle)
-        times.append(time.perf_counter() - began)
-        yield 0.1
-    facts["slider_worst_s"] = round(max(times), 4)
+    seen = set()
+    yield from drag(here(), "light_rotation", 60, lambda: seen.add(tuple(light())))
+    facts["light_while_dragged"], facts["dragged_to"] = len(seen), round(settings().light_rotation, 3)
+    expect(len(seen) > 5 and settings().light_rotation > 0.1, "the_light_follows_the_slider_as_it_is_dragged")
     expect(not np.allclose(light(), unturned), "slider_turns_the_light")
     expect(len(bpy.data.materials) == materials, "slider_makes_no_materials")
     yield 2

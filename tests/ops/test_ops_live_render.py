@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Rendered animations show no stale frame: each is compared with a still of a bake that was made at its frame."""
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from neural_gash_addon.scene import attributes, preview, rendered  # noqa: E402
+
+FRAMES = (2, 6, 10)
+SIDE = 24
+
+
+@pytest.fixture
+def eye(tmp_path):
+    """eye.render(name): what a camera above sees, written to a file; eye.pixels(name) reads it."""
+    scene = bpy.context.scene
+    camera = bpy.data.objects.new("Eye", bpy.data.cameras.new("Eye"))
+    camera.location = (0, 0, 4)
+    scene.collection.objects.link(camera)
+    scene.camera, scene.render.engine, scene.cycles.samples = camera, "CYCLES", 1
+    scene.render.resolution_x = scene.render.resolution_y = SIDE
+    scene.render.image_settings.file_format = "OPEN_EXR"
+    scene.neural_gash.light_source = "SKY"
+
+    class Eye:
+        def render(self, name, **what):
+            scene.render.filepath = str(tmp_path / name)
+            bpy.ops.render.render(**what)
+
+        def pixels(self, name):
+            image = bpy.data.images.load(str(tmp_path / name))
+            values = np.empty(SIDE * SIDE * 4, np.float32)
+            image.pixels.foreach_get(values)
+            bpy.data.images.remove(image)
+            return values
+
+        def moving(self):
+            """The pictures of the animation, rendered while the window stays at frame 1."""
+            scene.frame_start, scene.frame_end, scene.frame_step = FRAMES[0], FRAMES[-1], FRAMES[1] - FRAMES[0]
+            scene.frame_set(1)
+            self.render("moving", animation=True)
+            return [self.pixels(f"moving{frame:04}.exr") for frame in FRAMES]
+
+        def still(self):
+            """The current frame, of the bake as it is."""
+            self.render("still.exr", write_still=True)
+            found = self.pixels("still.exr")
+            (tmp_path / "still.exr").unlink()
+            return found
+    return Eye()
+
+
+def _drive(obj):
+    """The shape key by a driver, which turns with the frames."""
+    key = obj.data.shape_keys
+    key.animation_data_clear()
+    curve = key.key_blocks["Up"].driver_add("value")
+    curve.driver.expression = "(frame - 1) / 9"
+
+
+def _twist(obj):
+    """A modifier of the object instead of the shape key."""
+    obj.shape_key_clear()
+    twist = obj.modifiers.new("Twist", "SIMPLE_DEFORM")
+    twist.deform_method, twist.deform_axis = "TWIST", "X"
+    for frame, angle in ((1, 0.0), (10, 2.5)):
+        twist.angle = angle
+        twist.keyframe_insert("angle", frame=frame)
+
+
+def _all(obj):
+    """An armature and a driver on top of the keyed shape."""
+    rig = bpy.data.objects.new("Rig", bpy.data.armatures.new("Rig"))
+    bpy.context.scene.collection.objects.link(rig)
+    bpy.context.view_layer.objects.active = rig
+    bpy.ops.object.mode_set(mode="EDIT")
+    bone = rig.data.edit_bones.new("Bone")
+    bone.head, bone.tail = (-0.2, 0, 0), (-1, 0, 0)
+    bpy.ops.object.mode_set(mode="OBJECT")
+    obj.vertex_groups.new(name="Bone").add([v.index for v in obj.data.vertices if v.co.x < -0.2], 1.0, "REPLACE")
+    obj.modifiers.new("Rig", "ARMATURE").object = rig
+    pose = rig.pose.bones["Bone"]
+    pose.rotation_mode = "XYZ"
+    for frame, angle in ((1, 0.0), (10, -1.0)):
+        pose.rotation_euler.z = pose.rotation_euler.x = angle
+        pose.keyframe_insert("rotation_euler", frame=frame)
+    curve = obj.driver_add("scale", 1)
+    curve.driver.expression = "1 - frame / 40"
+    bpy.context.view_layer.objects.active = obj
+    bpy.context.scene.frame_set(1)
+    assert bpy.ops.neural_gash.bake() == {"FINISHED"}
+
+
+@pytest.mark.parametrize("how", ["live", "sequence"])
+@pytest.mark.parametrize("animate", [None, _drive, _twist, _all], ids=["keyed", "driven", "modifier", "all"])
+def test_a_render_of_the_animation_shows_no_stale_frame(wing, settings, tmp_path, eye, animate, how):
+    if animate:
+        animate(wing)
+    scene = bpy.context.scene
+    scene.frame_end = 10
+    if how == "live":
+        settings.live = True
+    else:
+        settings.sequence_folder = str(tmp_path)
+        bpy.ops.neural_gash.bake_sequence()
+    moving = eye.moving()
+    settings.live = False
+    for frame, picture in zip(FRAMES, moving, strict=True):
+        scene.frame_set(frame)
+        bpy.ops.neural_gash.bake()
+        np.testing.assert_allclose(picture, eye.still(), atol=2e-3)
+    assert np.abs(moving[0] - moving[2]).max() > 0.1
+
+
+def test_bounces_are_followed_in_rendered_frames(wing, settings, eye):
+    wing.data.materials.clear()
+    wing.data.materials.append(bpy.data.materials.new("Red"))
+    wing.data.materials[0].diffuse_color = (0.9, 0.1, 0.1, 1)
+    settings.bounces = 2
+    bpy.ops.neural_gash.bake()
+    settings.live = True
+    moving = eye.moving()
+    assert attributes.read_record(wing).colours == 3
+    settings.live = False
+    for frame, picture in zip(FRAMES, moving, strict=True):
+        bpy.context.scene.frame_set(frame)
+        bpy.ops.neural_gash.bake()
+        np.testing.assert_allclose(picture, eye.still(), atol=2e-3)
+    direct = moving[2].copy()
+    settings.bounces = 0
+    bpy.ops.neural_gash.bake()
+    assert np.abs(direct - eye.still()).max() > 0.02
+
+
+@pytest.mark.parametrize("why", ["texture", "topology", "sequence that ends", "sequence that is gone"])
+def test_where_it_cannot_follow_own_materials_are_rendered(wing, settings, tmp_path, eye, caplog, why):
+    """And said; the preview is back when the render is over."""
+    scene = bpy.context.scene
+    settings.live = not why.startswith("sequence")
+    if why == "texture":
+        settings.target, settings.side = "TEXTURE", 32
+        bpy.ops.neural_gash.bake()
+    elif why == "topology":
+        more = wing.modifiers.new("More", "SUBSURF")
+        more.levels = more.render_levels = 1
+        more.show_viewport = more.show_render = False
+        for path in ("show_viewport", "show_render"):
+            more.keyframe_insert(path, frame=1)
+        more.show_viewport = more.show_render = True
+        for path in ("show_viewport", "show_render"):
+            more.keyframe_insert(path, frame=6)
+        scene.frame_set(1)
+    else:
+        scene.frame_end = 2
+        settings.sequence_folder = str(tmp_path)
+        bpy.ops.neural_gash.bake_sequence()
+    slots = [(slot.link, slot.material) for slot in wing.material_slots]
+    if why.endswith("gone"):
+        (tmp_path / "Wing.prtseq").unlink()
+    with caplog.at_level(logging.WARNING):
+        moving = eye.moving()
+    said = [record.message for record in caplog.records if "own materials are rendered" in record.message]
+    first = {"texture": 2, "topology": 6, "sequence that ends": 6, "sequence that is gone": 2}[why]
+    assert [line.split(":")[0] for line in said] == [f"Frame {first}"] and "'Wing'" in said[0]
+    assert preview.is_on(wing) and not rendered._aside
+    assert [(slot.link, preview.is_preview(slot.material)) for slot in wing.material_slots] == [
+        (link, True) for link, _ in slots]
+    preview.preview_off(wing)
+    settings.live = False
+    own = []
+    for frame in FRAMES:
+        scene.frame_set(frame)
+        own.append(eye.still())
+    for frame, picture, plain in zip(FRAMES, moving, own, strict=True):
+        assert np.allclose(picture, plain, atol=2e-3) == (frame >= first)
+
+
+def test_a_stale_bake_that_nothing_follows_is_rendered_as_it_is(wing, settings, eye, caplog):
+    with caplog.at_level(logging.WARNING):
+        moving = eye.moving()
+    assert not caplog.records and preview.is_on(wing) and moving[2].any()
