@@ -32,6 +32,7 @@ docs-pictures: .venv/ready
 	$(PY) demo/demo.py --out docs
 	$(PY) demo/textures.py --out docs
 	$(PY) demo/glossy.py --out docs
+	$(PY) demo/lamps.py --out docs
 
 test: .venv/ready
 	$(PY) -m pytest

@@ -207,7 +207,8 @@ class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):
             layout.prop_search(settings, "uv_map", obj.data, "uv_layers")
         layout.prop(settings, "sizing", expand=True)
         if settings.sizing == FIT:
-            if settings.quality == RAYS or not (METHODS[settings.method].traces or settings.lamps):
+            traces = METHODS[settings.method].traces
+            if not (settings.quality != RAYS if traces else settings.lamps):  # else it is above already
                 layout.prop(settings, "tolerance")
         else:
             layout.prop(settings, "texels_per_metre" if settings.sizing == DENSITY and not settings.uv_map else "side")

@@ -86,7 +86,7 @@ def read_lamps(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[L
 
 
 def _emission(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArray[np.int32], known: Images
-                      ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[str]]:
+              ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[str]]:
     """Radiance (F, 3) of the triangles with these face corners (F, 3), of images their mean over each.
 
     Args:
@@ -128,10 +128,11 @@ def _key(parts: list[_Part], grain: float) -> str:
     """What tells a scene from others, in whatever order Blender lists it. grain: of its places, metres."""
     entries = []
     for part in parts:
-        digest = hashlib.blake2b(np.rint(part.positions / grain).tobytes() + part.triangles.tobytes(), digest_size=16)
+        places = np.rint(part.positions / grain) + 0.0  # no -0
+        digest = hashlib.blake2b(places.tobytes() + part.triangles.tobytes(), digest_size=16)
         for values in (part.albedo, part.emission, *(p.lookups()[..., p.columns < 3] for p in part.pictures)):
             size = float(np.abs(values).max(initial=0.0)) or 1.0
-            digest.update(f"{size:.5g}".encode() + np.rint(values / (_SAME * size)).tobytes())
+            digest.update(f"{size:.5g}".encode() + (np.rint(values / (_SAME * size)) + 0.0).tobytes())
         entries.append(digest.digest())
     return hashlib.blake2b(b"".join(sorted(entries)), digest_size=16).hexdigest()
 

@@ -379,3 +379,20 @@ def test_a_saved_file_shows_the_same(floor, tmp_path):
     again = bpy.data.objects["Floor"]
     assert staleness.check(again)
     np.testing.assert_allclose(picture([again]), before, rtol=1e-4)
+
+
+@pytest.mark.parametrize("method, quality, shown", [("analytic", "RAYS", 1), ("embree", "RAYS", 0),
+                                                    ("embree", "TOLERANCE", 1)])
+def test_the_panel_shows_what_lamps_need(floor, settings, method, quality, shown):
+    from .test_ops_registration import _draw
+    area()
+    bake()
+    assert "lamps_strength" in _draw("light")
+    assert any(text.startswith("Lamps: estimated error") for text in _draw("main"))
+    settings.method, settings.quality = method, quality
+    assert "lamps" in _draw("settings") and _draw("settings").count("tolerance") == shown
+    settings.target, settings.sizing = "TEXTURE", "FIT"
+    assert _draw("settings").count("tolerance") == 1
+    settings.lamps, settings.target = False, "VERTICES"
+    bake()
+    assert "lamps_strength" not in _draw("light")

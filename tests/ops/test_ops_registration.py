@@ -83,6 +83,9 @@ class Layout:
         assert name in owner.bl_rna.properties
         self.shown.append(name)
 
+    def prop_search(self, owner, name, _places, _list):
+        self.prop(owner, name)
+
     def label(self, text="", **_):
         self.shown.append(text)
 
@@ -98,7 +101,7 @@ def _draw(name):
     cls = getattr(panels, f"NEURAL_GASH_PT_{name}")
     layout = Layout()
     stand_in = SimpleNamespace(layout=layout)
-    for helper in ("_readout",):
+    for helper in ("_readout", "_texture"):
         if hasattr(cls, helper):
             setattr(stand_in, helper, getattr(cls, helper).__get__(stand_in))
     cls.draw(stand_in, bpy.context)

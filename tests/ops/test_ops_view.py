@@ -118,8 +118,8 @@ def test_glossy_previews_are_dull_in_a_view(make, settings):
 
 def test_numbers_have_units(settings):
     kinds = {p.identifier: p.subtype for p in settings.bl_rna.properties if p.type in ("INT", "FLOAT")}
-    # counts, a factor without a bound, and texels a metre, for which Blender has no unit: their names say what they are
-    plain = {"order", "rays", "bounces", "coefficient", "light_strength", "texels_per_metre"}
+    # counts, factors without a bound, and texels a metre, for which Blender has no unit: their names say what they are
+    plain = {"order", "rays", "bounces", "coefficient", "light_strength", "lamps_strength", "texels_per_metre"}
     assert {name for name, kind in kinds.items() if kind == "NONE"} == plain
     assert (kinds["side"], kinds["light_rotation"], kinds["tolerance"]) == ("PIXEL", "ANGLE", "FACTOR")
 
