@@ -20,11 +20,12 @@ from scipy.ndimage import gaussian_filter
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from neural_gash_addon.backend import embedding, embedding_bake, irradiance, methods
-from neural_gash_addon.backend.lit_points import STRAIGHT, lit_points
+from neural_gash_addon.backend.embedding_bake import STRAIGHT
+from neural_gash_addon.backend.lit_points import lit_points
 from training import embedding as judging
 from training import room_labels, room_views
 
-REFERENCE, USUAL = 3072, 64  # paths
+REFERENCE, USUAL = 2048, 64  # paths
 
 
 def ssim(one: NDArray, other: NDArray) -> float:
@@ -49,7 +50,7 @@ def main() -> None:
     """Print the table, write the picture."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rooms", type=int, default=4, help="of the split evaluation, after the Cornell box")
-    parser.add_argument("--width", type=int, default=96)
+    parser.add_argument("--width", type=int, default=128)
     parser.add_argument("--reference", type=int, default=REFERENCE, help="paths")
     parser.add_argument("--out", type=Path, default=Path("out"))
     arguments = parser.parse_args()

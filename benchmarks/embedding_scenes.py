@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from neural_gash_addon.backend import embedding_bake, irradiance, methods
-from neural_gash_addon.backend.lit_points import POINTS, REFLECTED, STRAIGHT, LitPoints, lit_points
+from neural_gash_addon.backend.embedding_bake import STRAIGHT
+from neural_gash_addon.backend.lit_points import POINTS, REFLECTED, LitPoints, lit_points
 from neural_gash_addon.backend.lit_scene import LitScene
 from neural_gash_addon.backend.nearest import nearest_to
 from training import embedding as judging

@@ -17,13 +17,14 @@ from . import irradiance as tracing
 from .errors import UserError
 from .geometry import NOT_FINITE
 from .irradiance import Irradiance
-from .lit_points import STRAIGHT, LitPoints, lit_points
+from .lit_points import LitPoints, lit_points
 from .lit_scene import LitScene
 from .nearest import nearest_to
 from .paper_bake import import_torch
 from .progress import scaled
 from .raycast import Occluders
 
+STRAIGHT = 128                  # paths for light straight from emitters: what they cost is about what decoding does
 QUERIES_AT_ONCE = 4096          # decoded together, so that memory does not grow with their number
 CHECKED, CHECKS = 128, 1024     # points whose reflected light is traced as well, to know the error; paths of each
 
