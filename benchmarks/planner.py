@@ -62,10 +62,11 @@ def looking(mesh: TriangleMesh, tolerance: float, baked: NDArray, repeats: int) 
         began = time.process_time()
         found = methods.run(auto_bake.planned(mesh, ORDER, None, tolerance, [], 0, 1, None))
         spent = time.process_time() - began
-        if found.scene is not None and found.plan.method != "analytic":
+        if found.plan.method != "analytic":
             began = time.process_time()
             methods.METHODS["embree"].sees(mesh, [])
             spent -= time.process_time() - began
+        if found.scene is not None:
             began = time.process_time()
             with ThreadPoolExecutor(1) as pool:
                 methods.run(advice.inside_faces(mesh, found.scene, baked, ORDER, tolerance, 0, pool, 1))

@@ -31,6 +31,7 @@ _TRIALS = 128, 512    # texels a side of the textures that are tried, at
 _TRIED = slice(None, None, 2)  # of the points
 _LEAST_RATE, _MOST_RATE = 0.5, 2.0  # powers of the side by which an error falls: at a shadow's edge, where smooth
 _FULL = 0.6           # of a texture that its charts cover, about
+_DARK = 1e-3          # of the transfer in the open: less than this on the whole is not seen
 _FACING = 0.5         # cosine from which on neighbours are of one chart
 _SIDES = 64, 4096     # of a texture that is advised, powers of two
 
@@ -78,9 +79,10 @@ def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray[np.
 
     faces, u, v = sampling.on_triangles(np.cumsum(areas), rng.random((2, _POINTS)))
     weights = np.stack([1 - u - v, u, v], 1)
-    one, two = yield from traced(_points(mesh, of_corner, faces, weights))
+    some = _points(mesh, of_corner, faces, weights)
+    one, two = yield from traced(some)
     energy = float((one * two).sum())
-    if energy <= 0:
+    if energy <= _DARK ** 2 * float(np.square(sh.cosine_lobe(some.normals, order)).sum()):
         return ""
     baked = np.einsum("nc,nck->nk", weights, coefficients[of_corner[faces]].astype(np.float64))
     error = _product(one - baked, two - baked, energy)

@@ -50,7 +50,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     error, probes = record.error_estimate, record.probe_rays
     if plan.method == "analytic":
         error = pilot.blocked if pilot is not None else 0.0
-    elif pilot is not None and tolerance is not None and found.scene is not None:
+    if pilot is not None and tolerance is not None and found.scene is not None:
         threads = threads or default_threads()
         with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
             asking = advice.inside_faces(mesh, found.scene, transfer.coefficients, order, tolerance, seed, pool,
