@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The bake as planned (`auto`): plan, then run the method that was chosen; the record says which and why."""
+"""The bake as planned (`auto`): plan, run the method that was chosen, and say what would be seen better.
+
+The record has a sentence for each choice: method and rays, domain, target (and bounces, see `bounce`).
+"""
 from __future__ import annotations
 
 import time
@@ -7,6 +10,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
+from . import advice
 from .geometry import TriangleMesh
 from .pilot import Pilot, look
 from .plan import Plan, choose, nothing_blocks
@@ -42,14 +46,20 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     work = bakers[plan.method](mesh, order, rays=plan.rays, tolerance=plan.tolerance, occluders=occluders, seed=seed,
                                threads=threads, scene=found.scene, **known)
     transfer = yield from scaled(work, _PILOT_SHARE, 1 - _PILOT_SHARE)
-    record = transfer.record
+    record = replace(transfer.record, plan=plan.reason).also(advice.domain(mesh))
     error, probes = record.error_estimate, record.probe_rays
     if plan.method == "analytic":
         error = pilot.blocked if pilot is not None else 0.0
+    if pilot is not None and tolerance is not None and found.scene is not None:
+        threads = threads or default_threads()
+        with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+            asking = advice.inside_faces(mesh, found.scene, transfer.coefficients, order, tolerance, seed, pool,
+                                         threads)
+            record = record.also((yield from scaled(asking, 1, 0)))
     if pilot is not None:
         probes += pilot.traced
     return Transfer(transfer.coefficients, replace(record, probe_rays=probes, seconds=time.perf_counter() - began,
-                                                   tolerance=tolerance, error_estimate=error, plan=plan.reason))
+                                                   tolerance=tolerance, error_estimate=error))
 
 
 def planned(mesh: TriangleMesh, order: int, rays: int | None, tolerance: float | None, occluders: Sequence[Geometry],

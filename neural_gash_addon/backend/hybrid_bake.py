@@ -24,9 +24,12 @@ from .workers import default_threads
 
 FIRST_RAYS = 4        # of a bake to a tolerance, where nothing is known beforehand
 _LADDER = sorted([2 ** k for k in range(2, 13)] + [3 * 2 ** k for k in range(1, 11)])  # rays of one to a tolerance
-_TAKEN, _TAKES = 0.36, 0.225  # the error with 4 rays beside a plain bake's, and the power of rays by which it nears it
+_TAKEN, _TAKES = 0.34, 0.225  # the error with 4 rays beside a plain bake's, and the power of rays by which it nears it
 _FALLS = 0.55         # the error falls as rays**-_FALLS, for saying how many rays more are wanted
 _STEP = 1.4, 4.0      # from a number of rays to the next, at least and at most
+_MARGIN = 0.92        # of the tolerance at which it stops: of several measures the first that is too low is met
+_DARE = 1.2           # times the tolerance are to be met by the first rays, where it is dear to have taken too many:
+_DEAR = 32            # with so many
 _ROWS = 1 << 14       # whose unshadowed transfer one worker computes at a time
 _SAMPLE = 128         # points at which the error is measured, or a 256th of them if that is more
 _MOST_SAMPLE = 2048
@@ -42,7 +45,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     With a tolerance there are more rays until the measured error is within it, or they are MAX_RAYS. pilot: what is
     known beforehand; its points are those at which the error is measured.
     """
-    began = time.perf_counter()
+    began, asked = time.perf_counter(), tolerance
     network = load_hybrid()
     threads = threads or default_threads()
     if scene is None:
@@ -55,7 +58,12 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
                       [slice(start, start + _ROWS) for start in range(0, len(unshadowed), _ROWS)]))
         work = _Work(mesh, scene, order, seed, last, lit, pool, threads, network, unshadowed, tolerance)
         error, used, left = None, 0, 1.0
-        stop = last if tolerance is None else FIRST_RAYS if pilot is None else expected_rays(pilot, tolerance)
+        stop = last
+        if tolerance is not None:
+            tolerance *= _MARGIN
+            stop = FIRST_RAYS if pilot is None else expected_rays(pilot, tolerance)
+            if pilot is not None and stop >= _DEAR:
+                stop = expected_rays(pilot, _DARE * tolerance)
         blocked = np.zeros_like(unshadowed)
         sample = None
         if len(lit):  # beside the rest, which waits for rays
@@ -72,7 +80,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     return Transfer(unshadowed - blocked, BakeRecord(
         method="hybrid", order=order, points=len(mesh.points), domain=mesh.domain, seed=seed, rays=used * len(lit),
         probe_rays=work.probes if pilot is None else 0, seconds=time.perf_counter() - began,
-        error_estimate=error if len(lit) else 0.0, tolerance=tolerance))
+        error_estimate=error if len(lit) else 0.0, tolerance=asked))
 
 
 def expected_rays(pilot: Pilot, tolerance: float) -> int:

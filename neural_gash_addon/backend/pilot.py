@@ -21,7 +21,7 @@ from .geometry import TriangleMesh
 from .raycast import Occluders
 
 POINTS = 256                  # or a 16th of them all, if that is less; or a 256th, if that is more
-_FEWEST, _MOST = 96, 2048
+_FEWEST, _MOST = 128, 2048
 _NOISE, _NOISE_RAYS = 0.025, 64  # about the noise of so many rays, on most meshes
 _LEAST_RAYS, _MOST_RAYS = 16, 128
 _SETS = 4

@@ -26,7 +26,7 @@ from .raycast import Geometry, used
 from .workers import product
 
 _SAFE = 1.1                  # what the pilot's noise may be too low by
-_MARGIN = 0.95               # of a tolerance, for who stops at its own measure: it stops where that is a little too low
+_MARGIN = 0.95               # of a tolerance, for who measures it: the measure is a little too low where it stops
 _FEW_RAYS = (4, 6, 8, 12, 16, 24, 32, 48)  # of plain bakes below what an adaptive one takes at least
 _EMBREE_SECONDS, _HYBRID_SECONDS = 1e-3, 3e-3  # what a bake costs at all,
 _EMBREE_RAYS, _HYBRID_RAYS = 6.0, 10.0  # and at each point besides its rays, in rays
@@ -102,7 +102,7 @@ def plans(found: Pilot, points: int, tolerance: float) -> list[Plan]:
     if enough:
         out.append(Plan("embree", rays=enough[0], reason=f"Shadows are {_percent(found.blocked)} of the whole, so "
                         f"{enough[0]} rays a point are enough for {_percent(tolerance)}."))
-    out.append(Plan("hybrid", tolerance=measured, reason=f"{expected_rays(found, measured)} rays a point, averaged "
+    out.append(Plan("hybrid", tolerance=tolerance, reason=f"{expected_rays(found, tolerance)} rays a point, averaged "
                     f"over neighbours by the network, are enough for {_percent(tolerance)}."))
     if points >= SPARSE_POINTS:
         out.append(Plan("sparse", tolerance=measured, reason=f"{points:,} points are dense: some are traced, and the "

@@ -71,8 +71,8 @@ class BakeRecord:
         return self.terms + (3 if self.lamps else 0)
 
     def also(self, sentence: str) -> BakeRecord:
-        """The same, with one sentence more of why, if it was planned."""
-        return replace(self, plan=f"{self.plan} {sentence}") if self.plan else self
+        """The same, with one sentence more (unless it is '') of why, if it was planned."""
+        return replace(self, plan=f"{self.plan} {sentence}") if self.plan and sentence else self
 
     def to_json(self) -> str:
         """One line of JSON."""

@@ -70,6 +70,26 @@ def test_the_tolerance_is_kept_and_the_plan_recorded(tolerance):
     assert BakeRecord.from_json(found.record.to_json()) == found.record
 
 
+def test_tolerances_are_missed_seldom_and_by_little():
+    """Small meshes of several kinds, against two references of 2,048 rays whose noise cancels."""
+    rng = np.random.default_rng(3)
+    balls = [sphere(2) for _ in range(6)]
+    heap = (np.concatenate([p + 1.4 * rng.normal(size=3) for p, _ in balls]),
+            np.concatenate([t + n * len(balls[0][0]) for n, (_, t) in enumerate(balls)]))
+    bumpy = sphere(4)
+    bumpy = bumpy[0] * (1 + 0.2 * np.sin(9 * bumpy[0]).prod(1, keepdims=True)), bumpy[1]
+    missed = []
+    for shape, smooth in ((torus(), True), (heap, True), (bumpy, True), (torus(sections=16), False)):
+        mesh = TriangleMesh.from_triangles(*shape, smooth=smooth)
+        one, two = (bake(mesh, method="embree", rays=2048, seed=seed).coefficients for seed in (98, 99))
+        for tolerance in (0.2, 0.1, 0.05, 0.02):
+            for seed in range(3):
+                found = bake(mesh, method="auto", tolerance=tolerance, seed=seed).coefficients
+                squared = ((found - one) * (found - two)).sum() / (one * two).sum()
+                missed.append(max(squared, 0.0) ** 0.5 / tolerance)
+    assert np.mean(np.array(missed) > 1) <= 0.05 and max(missed) < 1.5
+
+
 def test_looser_tolerances_never_cost_more_and_the_cheapest_is_taken():
     found = seen(0.3, 0.03)
     for points in (500, 20_000, 1_000_000):
