@@ -51,13 +51,11 @@ class Filter(nn.Module):
         even = torch.cat([torch.zeros(len(blocked), 1), unshadowed[:, 1:] / hybrid.FULL], 1)
         now, out = blocked - blocked[:, :1] * even, []
         for order, network in zip(orders, self.passes, strict=True):
-            parts = []
-            whole = len(order) - len(order) % hybrid.SIZE
-            for rows, size in ((order[:whole], hybrid.SIZE), (order[whole:], len(order) - whole)):
-                if len(rows):
-                    here = rows.view(-1, size)
-                    parts.append(self._mixed(places[here], normals[here], now[here], rays, network).flatten(0, 1))
-            now = torch.empty_like(now).index_copy(0, order, torch.cat(parts))
+            rows = torch.from_numpy(hybrid.blocks(order.numpy()))
+            mixed = self._mixed(places[rows], normals[rows], now[rows], rays, network).flatten(0, 1)
+            again = rows.numel() - len(order)  # at the beginning of the last block
+            last = rows.numel() - rows.shape[1]
+            now = torch.empty_like(now).index_copy(0, order, torch.cat([mixed[:last], mixed[last + again:]]))
             out.append(now + now[:, :1] * even)
         return out
 

@@ -98,41 +98,47 @@ def filtered(places: NDArray, normals: NDArray, orders: Sequence[NDArray], block
     Returns:
         (N, K).
     """
-    terms = blocked.shape[1]
+    count, terms = blocked.shape
     even = unshadowed[:, 1:] / np.float32(FULL)
-    now = np.ones((len(blocked), terms + 1), np.float32)  # the last counts, in sums over neighbours
-    now[:, :terms] = blocked
-    now[:, 1:terms] -= now[:, :1] * even
+    now = np.ones((count + 1, terms + 1), np.float32)  # the last column counts, in sums over neighbours
+    now[:-1, :terms] = blocked
+    now[:-1, 1:terms] -= now[:-1, :1] * even
     known = np.concatenate([places.T, normals.T], dtype=np.float32)
     for order, layers in zip(orders, network, strict=True):
         out = now.copy()
+        every = blocks(order)
+        into = every.copy()
+        into[-1:, :-len(order) % every.shape[1]] = count  # the last row is for what the block before has already
+        step = int(np.clip(len(every) // 4 + 1, *_BLOCKS))  # work for all threads, where it is enough
 
-        def part(rows: NDArray, size: int, now: NDArray = now, out: NDArray = out, layers: Sequence[Layer] = layers
-                 ) -> None:
-            values = now.take(rows, 0).reshape(-1, size, terms + 1)
+        def part(start: int, now: NDArray = now, out: NDArray = out, every: NDArray = every, into: NDArray = into,
+                 step: int = step, layers: Sequence[Layer] = layers) -> None:
+            rows, targets = every[start:start + step], into[start:start + step]
+            values = now.take(rows, 0)
             seen = values[..., 0].any(1)
             if not seen.any():
                 return
-            rows = rows.reshape(-1, size)
             if not seen.all():
-                rows, values = rows[seen], values[seen]
+                rows, targets, values = rows[seen], targets[seen], values[seen]
             here = known.take(rows, 1)
-            out[rows.ravel(), :terms] = mixed(here[:3], here[3:], values, rays, layers).reshape(-1, terms)
+            out[targets.ravel(), :terms] = mixed(here[:3], here[3:], values, rays, layers).reshape(-1, terms)
 
-        runs = blocks(order)
-        list(pool.map(part, *zip(*runs, strict=True)) if runs else ())
+        list(pool.map(part, range(0, len(every), step)))
         now = out
-    found = now[:, :terms].copy()
+    found = now[:-1, :terms].copy()
     found[:, 1:] += found[:, :1] * even
     return found
 
 
-def blocks(order: NDArray) -> list[tuple[NDArray, int]]:
-    """Runs of an order (N,) with the size of the blocks in each: of SIZE, and what is left over at its end."""
-    whole = len(order) - len(order) % SIZE
-    step = SIZE * int(np.clip(len(order) // (4 * SIZE) + 1, *_BLOCKS))  # work for all threads, where it is enough
-    runs = [(order[start:min(start + step, whole)], SIZE) for start in range(0, whole, step)]
-    return runs + ([(order[whole:], len(order) - whole)] if whole < len(order) else [])
+def blocks(order: NDArray) -> NDArray[np.int64]:
+    """(b, SIZE) of an order (N,), cut into as many as that takes; the last reaches back until it is whole too.
+
+    All in one block where there are fewer points than it would have.
+    """
+    size = max(min(SIZE, len(order)), 1)
+    whole = len(order) - len(order) % size
+    out = order[:whole].reshape(-1, size)
+    return out if whole == len(order) else np.concatenate([out, order[None, -size:]])
 
 
 def mixed(places: NDArray[np.float32], normals: NDArray[np.float32], values: NDArray[np.float32], rays: int,

@@ -50,37 +50,34 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     threads = threads or default_threads()
     if scene is None:
         scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
-    lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
     last = MAX_RAYS if rays is None else rays
-    unshadowed = np.empty((len(mesh.points), sh.coefficient_count(order)), np.float32)
+    coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
+    error: float | None = 0.0
+    used, probes, stop = 0, 0, last
+    if tolerance is not None:
+        tolerance *= _MARGIN
+        stop = FIRST_RAYS if pilot is None else expected_rays(pilot, tolerance)
+        if pilot is not None and stop >= _DEAR:
+            stop = expected_rays(pilot, _DARE * tolerance)
     with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
-        list(pool.map(lambda rows: np.copyto(unshadowed[rows], sh.cosine_lobe(mesh.normals[rows], order)),
-                      [slice(start, start + _ROWS) for start in range(0, len(unshadowed), _ROWS)]))
-        work = _Work(mesh, scene, order, seed, last, lit, pool, threads, network, unshadowed, tolerance)
-        error, used, left = None, 0, 1.0
-        stop = last
-        if tolerance is not None:
-            tolerance *= _MARGIN
-            stop = FIRST_RAYS if pilot is None else expected_rays(pilot, tolerance)
-            if pilot is not None and stop >= _DEAR:
-                stop = expected_rays(pilot, _DARE * tolerance)
-        blocked = np.zeros_like(unshadowed)
+        work = _Work(mesh, scene, order, seed, last, pool, threads, network, asked)
+        lit, left = work.lit, 1.0
         sample = None
         if len(lit):  # beside the rest, which waits for rays
-            sample = pool.submit(work.sample if pilot is None else lambda: pilot.sample)
+            sample = pool.submit(work.sample) if pilot is None else pool.submit(work.along, *pilot.sample)
         while sample is not None:
             share = left if tolerance is None else left / 2
             traced, taken = yield from scaled(work.trace(used, stop), 1 - left, share)
-            used, left = stop, left - share
+            used, left, probes = stop, left - share, work.probes if pilot is None else 0
             blocked = work.blended(traced, taken, *sample.result())
             error = work.error(blocked, *sample.result())
             if used == last or (error is not None and tolerance is not None and error <= tolerance):
+                coefficients[lit] = work.unshadowed - blocked
                 break
             stop = _more(used, error, tolerance)
-    return Transfer(unshadowed - blocked, BakeRecord(
+    return Transfer(coefficients, BakeRecord(
         method="hybrid", order=order, points=len(mesh.points), domain=mesh.domain, seed=seed, rays=used * len(lit),
-        probe_rays=work.probes if pilot is None else 0, seconds=time.perf_counter() - began,
-        error_estimate=error if len(lit) else 0.0, tolerance=asked))
+        probe_rays=probes, seconds=time.perf_counter() - began, error_estimate=error, tolerance=asked))
 
 
 def expected_rays(pilot: Pilot, tolerance: float) -> int:
@@ -101,60 +98,60 @@ def at_once(mesh: TriangleMesh, occluders: Sequence[Geometry], order: int, rays:
     network is followed wholly. That is right where rays are few.
     """
     scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
-    lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
-    unshadowed = sh.cosine_lobe(mesh.normals, order).astype(np.float32)
-    if not len(lit):
-        return unshadowed
+    coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
     threads = default_threads()
     with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
-        work = _Work(mesh, scene, order, seed, rays, lit, pool, threads, load_hybrid(), unshadowed)
-        return unshadowed - run(work.trace(0, rays))[1]
+        work = _Work(mesh, scene, order, seed, rays, pool, threads, load_hybrid())
+        if len(work.lit):
+            coefficients[work.lit] = work.unshadowed - run(work.trace(0, rays))[1]
+    return coefficients
 
 
 class _Work:
-    """The arrays of one bake."""
+    """The arrays of one bake, of the n points that have a normal, along the first curve."""
 
-    def __init__(self, mesh: TriangleMesh, scene: Occluders, order: int, seed: int, rays: int, lit: NDArray,
-                 pool: ThreadPoolExecutor, threads: int, network: Network, unshadowed: NDArray[np.float32],
-                 tolerance: float | None = None) -> None:
+    def __init__(self, mesh: TriangleMesh, scene: Occluders, order: int, seed: int, rays: int,
+                 pool: ThreadPoolExecutor, threads: int, network: Network, tolerance: float | None = None) -> None:
         self._estimator = BlockedEstimator(mesh, scene, order, seed, rays)
         self._mesh, self._scene, self._order, self._seed = mesh, scene, order, seed
-        self._unshadowed = unshadowed
         self._pool, self._threads, self._network = pool, threads, network
-        self._placed, self._curves = (np.zeros((0, 3)), np.zeros((0, 3))), [lit, lit]
-        if len(lit):
-            places, normals = placed(mesh.points[lit], mesh.normals[lit])
+        self.lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))  # (n,) which points they are
+        count = len(self.lit)
+        self._placed, self._curves = (np.zeros((0, 3)), np.zeros((0, 3))), [self.lit, self.lit]
+        if count:
+            places, normals = placed(mesh.points[self.lit], mesh.normals[self.lit])
             first, second = curves(places)
-            lit, self._placed = lit[first], (places[first], normals[first])  # points are in the first curve's order now
-            self._curves = [np.arange(len(lit)), np.argsort(first)[second]]
-        self._lit = lit
-        self._sums = np.zeros((len(lit), sh.coefficient_count(order)))
-        self._sample_size = min(len(lit), max(_SAMPLE, min(len(lit) // 256, _MOST_SAMPLE)))
+            self.lit, self._placed = self.lit[first], (places[first], normals[first])
+            self._curves = [np.arange(count), np.argsort(first)[second]]
+        self.unshadowed = np.empty((count, sh.coefficient_count(order)), np.float32)  # (n, K)
+
+        def fill(start: int) -> None:
+            rows = slice(start, start + _ROWS)
+            self.unshadowed[rows] = sh.cosine_lobe(mesh.normals[self.lit[rows]], order)
+
+        list(pool.map(fill, range(0, count, _ROWS)))
+        self._sums = np.zeros(self.unshadowed.shape)
+        self._sample_size = min(count, max(_SAMPLE, min(count // 256, _MOST_SAMPLE)))
         self._sample_rays = int(np.clip(_SAMPLE_TIMES * rays, _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS))
         if tolerance is not None:
-            self._sample_size, self._sample_rays = sample_size(len(lit)), pilot_rays(tolerance)
+            self._sample_size, self._sample_rays = sample_size(count), pilot_rays(tolerance)
         self.probes = 2 * self._sample_size * self._sample_rays
 
     def trace(self, start: int, stop: int) -> Generator[float, None, tuple[NDArray[np.float32], NDArray[np.float32]]]:
         """The blocked part of all points from directions start..stop in addition to those before.
 
         Returns:
-            (N, K) as it was traced, and as the network has it.
+            (n, K) as it was traced, and as the network has it.
         """
-        yield from self._estimator.trace(self._pool, self._threads, self._lit, start, stop, self._sums)
-        lit = self._lit
-        local = self._estimator.means(lit, self._sums, 0, stop)
-        traced = self._estimator.turned(self._pool, lit, local)
-        taken = filtered(*self._placed, self._curves, traced, self._unshadowed[lit], stop, self._network, self._pool)
-        out = np.zeros((2, *self._unshadowed.shape), np.float32)
-        out[0, lit], out[1, lit] = traced, taken
-        return out[0], out[1]
+        yield from self._estimator.trace(self._pool, self._threads, self.lit, start, stop, self._sums)
+        traced = self._estimator.turned(self._pool, self.lit, self._estimator.means(self.lit, self._sums, 0, stop))
+        return traced, filtered(*self._placed, self._curves, traced, self.unshadowed, stop, self._network, self._pool)
 
     def sample(self) -> tuple[NDArray, NDArray, NDArray]:
-        """Some points (n,), and two independent traces (n, K) of their blocked part; on the calling thread."""
+        """Some of the points (s,), and two independent traces (s, K) of their blocked part; on the calling thread."""
         rng = np.random.default_rng([self._seed, 1])
-        points = self._lit[np.sort(rng.choice(len(self._lit), self._sample_size, replace=False))]
-        twice = np.tile(points, 2)  # each point sees a net of its own
+        points = np.sort(rng.choice(len(self.lit), self._sample_size, replace=False))
+        twice = np.tile(self.lit[points], 2)  # each sees a net of its own
         few = replace(self._mesh, points=self._mesh.points[twice], normals=self._mesh.normals[twice],
                       clearance=self._mesh.clearance[twice])
         rows = np.arange(len(twice))
@@ -163,9 +160,14 @@ class _Work:
         one, two = np.split(twins.turned_here(rows, twins.means(rows, sums, 0, self._sample_rays)), 2)
         return points, one, two
 
+    def along(self, points: NDArray, one: NDArray, two: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """What `sample` gives, of points of the mesh that were traced before."""
+        order = np.argsort(self.lit)
+        return order[np.searchsorted(self.lit, points, sorter=order)], one, two
+
     def blended(self, traced: NDArray, taken: NDArray, points: NDArray, one: NDArray, two: NDArray
                 ) -> NDArray[np.float32]:
-        """traced + share * (taken - traced), (N, K), with the share of each band that is nearest the truth.
+        """traced + share * (taken - traced), (n, K), with the share of each band that is nearest the truth.
 
         The sample says so: its two traces are independent of both, so the sum of (traced + share d - one) (traced +
         share d - two) over it is the squared error and a constant, and is least where its derivative vanishes. So a
@@ -184,6 +186,6 @@ class _Work:
     def error(self, blocked: NDArray, points: NDArray, one: NDArray, two: NDArray) -> float | None:
         """Relative L2 error at the sample. Both traces' noise is independent, so it cancels in the product."""
         squared = float(((blocked[points] - one) * (blocked[points] - two)).sum())
-        open_sky = self._unshadowed[points]
+        open_sky = self.unshadowed[points]
         energy = float(((open_sky - one) * (open_sky - two)).sum())
         return float(max(squared, 0.0) / energy) ** 0.5 if energy > 0 else None
