@@ -52,7 +52,9 @@ def by_material(obj: bpy.types.Object, mesh: bpy.types.Mesh
     mesh.loop_triangles.foreach_get("polygon_index", polygons)
     slots = np.empty(len(mesh.polygons), np.int32)
     mesh.polygons.foreach_get("material_index", slots)
-    materials = [shown_material(slot.material.original if slot.material else None) for slot in obj.material_slots]
+    # not the original of a preview's: a frame handler may have removed it, while what is evaluated still names it
+    shown = [shown_material(slot.material) for slot in obj.material_slots]
+    materials = [material and material.original for material in shown]
     slot_of = np.clip(slots[polygons], 0, max(len(materials) - 1, 0))
     for number, material in enumerate(materials or [None]):
         here = np.flatnonzero(slot_of == number)
