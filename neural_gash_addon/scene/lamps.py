@@ -116,12 +116,18 @@ def _emission(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArray[np.i
         for colour, strength, part in found:
             channels = np.arange(3)
             pictures = socket_pictures(colour, mesh, corners[here], known, channels, channels, np.ones(3), np.zeros(3))
-            shown = pictures[0].lookups().mean(1) if pictures else number(colour)
+            shown = _means(pictures[0]) if pictures else number(colour)
             out[here] += part * number(strength)[0] * shown
             if material is not None and not (plain(strength) and (pictures or plain(colour))):
                 unread.append(material.name)
         alone[here] = emits_alone(material)
     return out, alone, unread
+
+
+def _means(picture: Picture) -> Array:
+    """(f, 3) of an image over each of its triangles, also where it is brighter than 1, which no albedo is."""
+    brightest = max(1.0, float(picture.pixels.max()))
+    return brightest * replace(picture, gain=picture.gain / brightest).lookups().mean(1)
 
 
 def _joined(meshes: list[_Part], lamps: list[_Part]) -> LitScene:
