@@ -22,8 +22,8 @@ from neural_gash_addon.scene.attributes import read_record
 from neural_gash_addon.scene.preview import preview_off
 from neural_gash_addon.scene.render import render_pixels, silent_blender
 
-RESOLUTION = (560, 520)
-CELLS = 64  # of a wall of 2 m, along its side
+RESOLUTION = (480, 446)
+CELLS = 48  # of a wall of 2 m, along its side
 WHITE, RED, GREEN = (0.73, 0.73, 0.73), (0.61, 0.06, 0.06), (0.12, 0.45, 0.1)
 
 
@@ -50,6 +50,8 @@ def grids(name: str, places: list[Matrix], materials: list[bpy.types.Material], 
     quads = first + [0, 1, cells + 2, cells + 1]
     positions = np.concatenate([flat @ np.array(place).T for place in places])[:, :3]
     faces = np.concatenate([quads + number * len(flat) for number in range(len(places))])
+    _, first, joined = np.unique(positions.round(6), axis=0, return_index=True, return_inverse=True)  # along the edges
+    positions, faces = positions[first], joined.reshape(-1)[faces]
     data = bpy.data.meshes.new(name)
     data.from_pydata(positions.tolist(), [], faces.tolist())
     kinds = list(dict.fromkeys(materials))
@@ -87,7 +89,7 @@ def build() -> list[bpy.types.Object]:
     ball.data.materials.append(material("Glow", (0.25, 0.5, 1), 6.0))
     bpy.ops.mesh.primitive_monkey_add(size=0.75, location=(-0.3, -0.05, -0.69), rotation=(-0.6, 0, 0.5))
     head = bpy.context.object
-    head.modifiers.new("Subdivision", "SUBSURF").levels = 2
+    head.modifiers.new("Subdivision", "SUBSURF").levels = 1
     bpy.ops.object.modifier_apply(modifier="Subdivision")
     head.data.materials.append(material("Head", (0.75, 0.6, 0.4)))
     for obj in (ball, head):
@@ -111,9 +113,10 @@ def build() -> list[bpy.types.Object]:
 
 
 def cycles(samples: int) -> np.ndarray:
-    """What Cycles makes of the scene: linear pixels (H, W, 4), top row first."""
+    """What Cycles makes of the scene, denoised: linear pixels (H, W, 4), top row first."""
     scene = bpy.context.scene
-    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", samples, False
+    scene.render.film_transparent = True
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", samples, True
     scene.cycles.max_bounces = scene.cycles.diffuse_bounces = 4  # as many as the bake follows
     scene.render.resolution_x, scene.render.resolution_y = RESOLUTION
     scene.render.image_settings.file_format, scene.render.image_settings.color_depth = "OPEN_EXR", "32"
@@ -123,19 +126,20 @@ def cycles(samples: int) -> np.ndarray:
         image = bpy.data.images.load(scene.render.filepath)
         pixels = np.empty((image.size[1], image.size[0], image.channels), np.float32)
         image.pixels.foreach_get(pixels.ravel())
-    return np.dstack([pixels[::-1, :, :3], np.ones(pixels.shape[:2], np.float32)])
+    return pixels[::-1]
 
 
 def main() -> None:
     """Bake the room, render its previews, then the room itself."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=demo.ROOT / "out", help="folder for the picture")
-    parser.add_argument("--samples", type=int, default=1024, help="of Cycles")
+    parser.add_argument("--samples", type=int, default=128, help="of Cycles (128)")
+    parser.add_argument("--tolerance", type=float, default=0.02, help="of the bakes (0.02)")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     objects = build()
     settings = bpy.context.scene.neural_gash
-    settings.lamps, settings.occluders, settings.tolerance = True, "VISIBLE", 0.05
+    settings.lamps, settings.occluders, settings.tolerance = True, "VISIBLE", arguments.tolerance
     with silent_blender():
         bpy.ops.neural_gash.bake()
         preview = render_pixels(objects, camera=bpy.context.scene.camera, resolution=RESOLUTION, samples=64)

@@ -2,6 +2,7 @@
 """What lamps add to a bake: irradiance at its points, to the same tolerance."""
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Generator
 from dataclasses import dataclass, replace
@@ -17,7 +18,8 @@ from .raycast import Occluders
 from .record import LAMPS_BASIS
 from .transfer import Transfer
 
-_PILOT = 0.1  # of the progress
+_PILOT = 0.1    # of the progress
+_SAFELY = 1.05  # times the paths that the error asks for, which is an estimate
 FEWEST, MOST = 32, 4096  # paths from a point, to begin with and where the tolerance is not met before
 
 
@@ -49,8 +51,11 @@ class Lamps:
 
     def _traced(self, mesh: TriangleMesh, seed: int, threads: int | None
                 ) -> Generator[float, None, tuple[Irradiance, int]]:
-        """Irradiance, and its paths from each point: as many again as there are until the error is small enough."""
-        rays = -(-(self.rays or FEWEST) // BATCHES) * BATCHES
+        """Irradiance, and its paths from each point.
+
+        To a tolerance, as many paths again as there are, or the fewer that the error so far asks for, until it is met.
+        """
+        rays = _whole_batches(self.rays or FEWEST)
         tolerance = np.inf if self.tolerance is None else self.tolerance
         found: Irradiance | None = None
         done = 0
@@ -59,14 +64,14 @@ class Lamps:
             more = yield from scaled(irradiance(
                 self.scene, mesh.points, mesh.normals, rays, seed=_seed(seed, number), threads=threads,
                 occluders=self._occluders, clearance=mesh.clearance), start, share)
-            found = more if found is None else _mean(found, more)
+            found = more if found is None else _mean(found, done, more, rays)
             done, start = done + rays, start + share
             error = relative(found)
             if error <= tolerance or done >= MOST:
                 break
-            rays = done
-            wanted = min(MOST, done * (error / tolerance) ** 2)
-            share = (1 - start) * min(1, rays / (wanted - done))
+            missing = min(MOST, _SAFELY * done * (error / tolerance) ** 2) - done
+            rays = _whole_batches(min(done, missing))
+            share = (1 - start) * min(1.0, rays / missing)
         assert found is not None
         return found, done
 
@@ -77,9 +82,15 @@ def relative(found: Irradiance) -> float:
     return float(np.square(found.error, dtype=np.float64).sum() / energy) ** 0.5 if energy else 0.0
 
 
-def _mean(first: Irradiance, second: Irradiance) -> Irradiance:
-    """Of two with as many paths each."""
-    return Irradiance((first.values + second.values) / 2, np.hypot(first.error, second.error) / 2, first.notice)
+def _mean(first: Irradiance, rays: int, second: Irradiance, more: int) -> Irradiance:
+    """Of two with these numbers of paths."""
+    a, b = np.float32(rays / (rays + more)), np.float32(more / (rays + more))
+    return Irradiance(a * first.values + b * second.values, np.hypot(a * first.error, b * second.error), first.notice)
+
+
+def _whole_batches(rays: float) -> int:
+    """So many paths or a few more, which the tracer can deal out evenly."""
+    return max(1, math.ceil(rays / BATCHES)) * BATCHES
 
 
 def _seed(seed: int, number: int) -> int:

@@ -19,6 +19,7 @@ from ..backend.texture import TextureTransfer, alike, merged
 from ..backend.transfer import Transfer
 from ..properties import TEXTURE, NeuralGashSettings
 from ..scene.images import make_images, remove_unused
+from ..scene.lamps import LitScenes
 from .job import Job, check, finish, prepare, size
 from .lamps import LampReader
 
@@ -63,7 +64,7 @@ def prepare_batch(context: bpy.types.Context, objects: Sequence[bpy.types.Object
     refused: list[Outcome] = []
     meshes: dict[int, str] = {}
     group = [obj for obj in objects if obj is not None and obj.type == "MESH"]
-    lamps = LampReader(context, settings) if settings.lamps else None
+    lamps = LampReader(context.evaluated_depsgraph_get(), settings) if settings.lamps else None
     for obj in objects:
         if obj is not None and obj.data is not None and obj.data.session_uid in meshes:
             refused.append(Outcome(obj.name, None, f"'{obj.name}' has the same mesh as "
@@ -132,12 +133,12 @@ def finish_batch(context: bpy.types.Context, batch: Batch, results: Sequence[Res
     outcomes = list(batch.refused)
     baked: list[tuple[Job, Transfer | TextureTransfer]] = []
     owners: list[bpy.types.Mesh] = []
-    lamps = LampReader(context, context.scene.neural_gash)  # as they are now
+    lit = LitScenes(context.evaluated_depsgraph_get())
     for job, result in zip(batch.jobs, results, strict=True):
         try:
             if isinstance(result, UserError):
                 raise result
-            if job.lamps is not None and lamps.of(check(context, job)).key != job.lamps.key:
+            if job.lamps is not None and lit.of(check(context, job))[1] != job.lamps.key:
                 raise UserError(f"The lamps of '{job.name}', or what they light, were changed during the bake; bake "
                                 "again.")
             if batch.shared:

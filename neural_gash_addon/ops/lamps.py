@@ -1,25 +1,23 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The lamps of a batch of bakes, read once for all objects that are shown."""
+"""The lamps of a batch of bakes, as its settings have them traced."""
 from __future__ import annotations
 
 import bpy
 
 from ..backend.lamps import Lamps
 from ..properties import NeuralGashSettings
-from ..scene.lamps import is_shown, read_lamps
+from ..scene.lamps import LitScenes
 
 
 class LampReader:
-    """What lights the objects of a batch."""
+    """What lights the objects of a batch; one for all that see the same, which share its preparations."""
 
-    def __init__(self, context: bpy.types.Context, settings: NeuralGashSettings) -> None:
+    def __init__(self, depsgraph: bpy.types.Depsgraph, settings: NeuralGashSettings) -> None:
         self._tracing = settings.tracing() or {"tolerance": settings.tolerance}
-        self._depsgraph = context.evaluated_depsgraph_get()
-        self._known: dict[int, Lamps] = {}  # session uid of an object that is hidden, or 0 of all others
+        self._scenes = LitScenes(depsgraph)
+        self._known: dict[str, Lamps] = {}
 
     def of(self, obj: bpy.types.Object) -> Lamps:
         """The lamps of an object. Raises UserError as `read_lamps`."""
-        uid = 0 if is_shown(obj, self._depsgraph) else obj.session_uid
-        if uid not in self._known:
-            self._known[uid] = Lamps(*read_lamps(obj, self._depsgraph), **self._tracing)
-        return self._known[uid]
+        scene, key, notice = self._scenes.of(obj)
+        return self._known.setdefault(key, Lamps(scene, key, notice, **self._tracing))

@@ -40,8 +40,23 @@ class _Part:
     pictures: Sequence[Picture] = ()
 
 
-def is_shown(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
-    """Whether `read_lamps` finds an object without being told of it."""
+class LitScenes:
+    """`read_lamps` of several objects as they stand now, read once for all that are shown."""
+
+    def __init__(self, depsgraph: bpy.types.Depsgraph) -> None:
+        self._depsgraph = depsgraph
+        self._known: dict[int, tuple[LitScene, str, str]] = {}  # session uid of an object that is hidden, 0: all others
+
+    def of(self, obj: bpy.types.Object) -> tuple[LitScene, str, str]:
+        """As `read_lamps`."""
+        uid = 0 if _is_shown(obj, self._depsgraph) else obj.session_uid
+        if uid not in self._known:
+            self._known[uid] = read_lamps(obj, self._depsgraph)
+        return self._known[uid]
+
+
+def _is_shown(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
+    """Whether `instances` lists an object."""
     return obj.session_uid in shown_objects(depsgraph)
 
 
@@ -67,7 +82,7 @@ def read_lamps(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[L
         return np.concatenate([finish, emission], axis=1), pictures
 
     solids = list(instances(depsgraph, finishing=finishing))
-    if not is_shown(obj, depsgraph):
+    if not _is_shown(obj, depsgraph):
         with evaluated(obj, depsgraph) as copy:
             own = solid_arrays(copy, finishing)
             if own is not None:
@@ -101,12 +116,18 @@ def _emission(obj: bpy.types.Object, mesh: bpy.types.Mesh, corners: NDArray[np.i
         for colour, strength, part in found:
             channels = np.arange(3)
             pictures = socket_pictures(colour, mesh, corners[here], known, channels, channels, np.ones(3), np.zeros(3))
-            shown = pictures[0].lookups().mean(1) if pictures else number(colour)
+            shown = _means(pictures[0]) if pictures else number(colour)
             out[here] += part * number(strength)[0] * shown
             if material is not None and not (plain(strength) and (pictures or plain(colour))):
                 unread.append(material.name)
         alone[here] = emits_alone(material)
     return out, alone, unread
+
+
+def _means(picture: Picture) -> Array:
+    """(f, 3) of an image over each of its triangles, also where it is brighter than 1, which no albedo is."""
+    brightest = max(1.0, float(picture.pixels.max()))
+    return brightest * replace(picture, gain=picture.gain / brightest).lookups().mean(1)
 
 
 def _joined(meshes: list[_Part], lamps: list[_Part]) -> LitScene:

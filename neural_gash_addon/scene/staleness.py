@@ -14,7 +14,7 @@ from ..backend.errors import UserError
 from ..backend.record import BakeRecord
 from .attributes import check_whole, has_bake, read_record
 from .gloss_bounce import finish_fits, finish_key, has_bounces
-from .lamps import read_lamps
+from .lamps import LitScenes
 from .preview import is_preview
 from .read import SELF, fingerprint, read_finish, same_fingerprint
 from .uv_maps import read_uv
@@ -40,30 +40,37 @@ def status(obj: bpy.types.Object | None) -> str:
     return _known.get(uid, CURRENT)
 
 
-def check(obj: bpy.types.Object) -> bool:
-    """Compare the object with its bake now: whether the bake still fits. Main thread only."""
-    current = fits(obj, bpy.context.evaluated_depsgraph_get())
+def check(obj: bpy.types.Object, lit: LitScenes | None = None) -> bool:
+    """Compare the object with its bake now: whether the bake still fits. Main thread only. lit: see `same`."""
+    current = fits(obj, bpy.context.evaluated_depsgraph_get(), lit)
     _known[obj.session_uid] = CURRENT if current else STALE
     _changed.discard(obj.session_uid)
     return current
 
 
-def fits(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
+def fits(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, lit: LitScenes | None = None) -> bool:
     """Whether the bake of an object is whole, and of the object as it stands evaluated."""
     try:
         record = read_record(obj)
         check_whole(obj.data, record)
-        return same(obj, record, depsgraph) and _gloss_fits(obj, record, depsgraph)
+        return same(obj, record, depsgraph, lit) and _gloss_fits(obj, record, depsgraph)
     except UserError:  # changed so far that it could not be baked again as it was
         return False
 
 
-def same(obj: bpy.types.Object, record: BakeRecord, depsgraph: bpy.types.Depsgraph) -> bool:
-    """Whether the object's shape, what shadows it and lamps are those of a bake. Raises UserError, as `fingerprint`."""
+def same(obj: bpy.types.Object, record: BakeRecord, depsgraph: bpy.types.Depsgraph, lit: LitScenes | None = None
+         ) -> bool:
+    """Whether the object's shape, what shadows it and what lights it are those of a bake.
+
+    Args:
+        lit: of the depsgraph, where several objects are compared.
+    Raises:
+        UserError: as `fingerprint` and `read_lamps`.
+    """
     uv = read_uv(obj.data, record.uv_map) if record.uv_map else None
     now = fingerprint(obj, depsgraph, record.occluders, uv, record.colours == 3)
     return (same_fingerprint(now, record.fingerprint)
-            and (not record.lamps or read_lamps(obj, depsgraph)[1] == record.lamps))
+            and (not record.lamps or (lit or LitScenes(depsgraph)).of(obj)[1] == record.lamps))
 
 
 def register() -> None:
@@ -130,6 +137,7 @@ def _compare_changed() -> None:
     _comparing = True
     try:
         layer.update()
+        lit = LitScenes(layer.depsgraph)
         changed = set(_changed)
         waiting = set()
         for obj in bpy.context.scene.objects:
@@ -138,7 +146,7 @@ def _compare_changed() -> None:
             if obj.mode == "EDIT":  # its mesh is still the one from before
                 waiting |= changed & {obj.session_uid}
             elif obj.session_uid in changed or _has_occluders(obj):
-                check(obj)
+                check(obj, lit)
         layer.update()  # reading a hidden object tags it as changed; heeding that would never end
         _changed.clear()
         _changed.update(waiting)

@@ -396,3 +396,20 @@ def test_the_panel_shows_what_lamps_need(floor, settings, method, quality, shown
     settings.lamps, settings.target = False, "VERTICES"
     bake()
     assert "lamps_strength" not in _draw("light")
+
+
+def test_the_scene_is_read_once_for_all_that_are_baked_together(floor, make, settings, monkeypatch):
+    from neural_gash_addon.scene import lamps, staleness
+    area()
+    objects = [floor, make(*PANEL, "One"), make([(x + 1, y, z) for x, y, z in PANEL[0]], PANEL[1], "Two")]
+    for obj in objects:
+        obj.select_set(True)
+    read, times = lamps.read_lamps, []
+    monkeypatch.setattr(lamps, "read_lamps", lambda *a: times.append(1) or read(*a))
+    bake()
+    assert len(times) == 2  # before and after
+    assert len({record(obj).lamps for obj in objects}) == 1
+    times.clear()
+    staleness._changed.update(obj.session_uid for obj in objects)
+    staleness._compare_changed()
+    assert len(times) == 1 and all(staleness._known[obj.session_uid] == "CURRENT" for obj in objects)

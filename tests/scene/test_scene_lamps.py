@@ -143,7 +143,7 @@ def test_an_image_emits_what_is_in_its_triangles(floor, make, cycles):
         x, y, _ = quad.data.vertices[loop.vertex_index].co
         quad.data.uv_layers["UV"].uv[loop.index].vector = (0.5 + x, 0.5 + y)
     image = bpy.data.images.new("even", 8, 8, float_buffer=True, is_data=True)
-    image.pixels.foreach_set(np.tile(np.array([0.2, 0.9, 0.4, 1], np.float32), 64))
+    image.pixels.foreach_set(np.tile(np.array([0.2, 2.5, 0.4, 1], np.float32), 64))
     material = shader(quad, "EMISSION", (1, 1, 1), 5.0)
     tree = material.node_tree
     texture = tree.nodes.new("ShaderNodeTexImage")
