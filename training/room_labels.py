@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rooms with the light in them, to train on, made once and kept: `python -m training.room_labels --rooms 200`.
+"""Rooms with the light in them, to train on, made once and kept: `python -m training.room_labels --rooms 160`.
 
 One .npz a room (see `label`) in training/cache/rooms/, which git ignores. A run that was stopped goes on where it
 was; a file made with other settings, or by another version of the generator, has another name. Light straight from
@@ -199,7 +199,7 @@ def prepare(wanted: Sequence[Job], cache: Path = CACHE, workers: int = 2, quiet:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line. 1 where a room could not be labelled."""
     parser = argparse.ArgumentParser(prog="python -m training.room_labels", description=__doc__)
-    parser.add_argument("--rooms", type=int, default=200, help="to train on")
+    parser.add_argument("--rooms", type=int, default=160, help="to train on")
     parser.add_argument("--validation", type=int, default=16, help="rooms to validate with")
     parser.add_argument("--evaluation", type=int, default=8, help="rooms to evaluate with, beside the Cornell box")
     parser.add_argument("--rays", type=int, default=TRAIN_RAYS, help="from each point of a room to train on")

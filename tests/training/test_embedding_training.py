@@ -12,7 +12,7 @@ from neural_gash_addon.backend import embedding_bake, methods  # noqa: E402
 from neural_gash_addon.backend.exchange import write_npz  # noqa: E402
 from neural_gash_addon.backend.lit_points import LitPoints  # noqa: E402
 from neural_gash_addon.backend.networks.embedding import Embedding, Settings  # noqa: E402
-from training import embedding, loop  # noqa: E402
+from training import embedding, loop, room_labels, rooms  # noqa: E402
 
 TINY = Settings(width=32, blocks=2, hidden=16, gathered=6, around=4, patch=64, neighbours=5)
 RECIPE = embedding.Recipe(TINY, steps=16, rate=3e-3, rooms=2, queries=100, every=8)
@@ -138,3 +138,16 @@ def test_baselines_are_right_where_it_is_known():
 def test_the_table_has_a_row_of_the_network_and_of_each_baseline(cache):
     lines = embedding.table(Embedding(TINY).eval(), [held_out(cache)]).splitlines()
     assert len(lines) == 2 + len(embedding.BASELINES)
+
+
+def test_the_weights_that_ship_are_better_than_what_needs_no_training(tmp_path):
+    """In a room of a seed that no split has."""
+    model = embedding_bake.network().cpu()
+    room = room_labels.label(rooms.generate(3_000_003), seed=3_000_003, split="evaluation", rays=1024, queries=1024)
+    write_npz(tmp_path / "room.npz", **room)
+    sample = embedding.load.__wrapped__(tmp_path / "room.npz", model.settings)
+    rows = embedding.held_rows(sample)
+    found = embedding.judged(embedding.network(model, sample), sample)
+    for name, give in embedding.BASELINES.items():
+        other = embedding.judged(give(sample, rows), sample)
+        assert found["relative"] < 0.8 * other["relative"] and found["squares"] < other["squares"], name
