@@ -48,7 +48,7 @@ def domain(mesh: TriangleMesh) -> str:
 
 
 def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray[np.float32], order: int, tolerance: float,
-                 seed: int, pool: ThreadPoolExecutor, threads: int) -> Generator[float, None, str]:
+                 seed: int, threads: int) -> Generator[float, None, str]:
     """One sentence: whether shadows inside faces follow their corners, or the texture that would have them.
 
     Args:
@@ -68,12 +68,13 @@ def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray[np.
 
     def traced(points: TriangleMesh, rays: int) -> Generator[float, None, Traced]:
         rows, found = np.arange(len(points.points)), []
-        for _ in range(2):
-            twin = BlockedEstimator(points, scene, order, int(rng.integers(2**31)), rays, _SETS)
-            sums = np.zeros((len(rows), order * order))
-            yield from twin.trace(pool, threads, rows, 0, rays, sums)
-            blocked = twin.turned_here(rows, twin.means(rows, sums, 0, rays))
-            found.append(sh.cosine_lobe(points.normals, order) - blocked)
+        with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+            for _ in range(2):
+                twin = BlockedEstimator(points, scene, order, int(rng.integers(2**31)), rays, _SETS)
+                sums = np.zeros((len(rows), order * order))
+                yield from twin.trace(pool, threads, rows, 0, rays, sums)
+                blocked = twin.turned_here(rows, twin.means(rows, sums, 0, rays))
+                found.append(sh.cosine_lobe(points.normals, order) - blocked)
         return found[0], found[1]
 
     faces, u, v = sampling.on_triangles(np.cumsum(areas), rng.random((2, _POINTS)))
