@@ -24,11 +24,11 @@ from .raycast import Occluders
 from .texels import texel_points
 
 _POINTS = 96
-_MOST_RAYS = 32       # of each trace
+_MOST_RAYS = 32       # of each trace of them,
+_TRIAL_RAYS = 16      # and of each texel's: four of them are averaged
 _SETS = 4
 _OWN_NOISE = 1.25     # of the tolerance: what corners that just keep to it may differ by inside faces that hold no edge
-_TRIALS = 128, 512    # texels a side of the textures that are tried, at
-_TRIED = slice(None, None, 2)  # of the points
+_TRIALS = 128, 512    # texels a side of the textures that are tried
 _LEAST_RATE, _MOST_RATE = 0.5, 2.0  # powers of the side by which an error falls: at a shadow's edge, where smooth
 _FULL = 0.6           # of a texture that its charts cover, about
 _DARK = 1e-3          # of the transfer in the open: less than this on the whole is not seen
@@ -48,7 +48,7 @@ def domain(mesh: TriangleMesh) -> str:
 
 
 def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray[np.float32], order: int, tolerance: float,
-                 seed: int, pool: ThreadPoolExecutor, threads: int) -> Generator[float, None, str]:
+                 seed: int, threads: int) -> Generator[float, None, str]:
     """One sentence: whether shadows inside faces follow their corners, or the texture that would have them.
 
     Args:
@@ -65,22 +65,22 @@ def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray[np.
         return ""
     of_corner = mesh.elements[of_corner]
     rng = np.random.default_rng([seed, 6])
-    rays = min(pilot_rays(tolerance), _MOST_RAYS)
 
-    def traced(points: TriangleMesh) -> Generator[float, None, Traced]:
+    def traced(points: TriangleMesh, rays: int) -> Generator[float, None, Traced]:
         rows, found = np.arange(len(points.points)), []
-        for _ in range(2):
-            twin = BlockedEstimator(points, scene, order, int(rng.integers(2**31)), rays, _SETS)
-            sums = np.zeros((len(rows), order * order))
-            yield from twin.trace(pool, threads, rows, 0, rays, sums)
-            blocked = twin.turned_here(rows, twin.means(rows, sums, 0, rays))
-            found.append(sh.cosine_lobe(points.normals, order) - blocked)
+        with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+            for _ in range(2):
+                twin = BlockedEstimator(points, scene, order, int(rng.integers(2**31)), rays, _SETS)
+                sums = np.zeros((len(rows), order * order))
+                yield from twin.trace(pool, threads, rows, 0, rays, sums)
+                blocked = twin.turned_here(rows, twin.means(rows, sums, 0, rays))
+                found.append(sh.cosine_lobe(points.normals, order) - blocked)
         return found[0], found[1]
 
     faces, u, v = sampling.on_triangles(np.cumsum(areas), rng.random((2, _POINTS)))
     weights = np.stack([1 - u - v, u, v], 1)
     some = _points(mesh, of_corner, faces, weights)
-    one, two = yield from traced(some)
+    one, two = yield from traced(some, min(pilot_rays(tolerance), _MOST_RAYS))
     energy = float((one * two).sum())
     if energy <= _DARK ** 2 * float(np.square(sh.cosine_lobe(some.normals, order)).sum()):
         return ""
@@ -89,12 +89,10 @@ def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray[np.
     if error <= _OWN_NOISE * tolerance:
         return f"Shadows inside faces follow their corners to {max(100 * error, 1):.0f} %: vertices are enough."
     errors = []
-    faces, weights, one, two = faces[_TRIED], weights[_TRIED], one[_TRIED], two[_TRIED]
-    energy = max(float((one * two).sum()), 1e-3 * energy)
     for side in _TRIALS:
         spacing = float(areas.sum() / _FULL) ** 0.5 / side
         near, at, mix = around(mesh, scene, faces, weights, spacing, rng)
-        first, second = yield from traced(_points(mesh, of_corner, near, at))
+        first, second = yield from traced(_points(mesh, of_corner, near, at), _TRIAL_RAYS)
         seen = mix.any(1)[:, None]
         first, second = (np.einsum("nc,nck->nk", mix, found.reshape(*mix.shape, -1)) for found in (first, second))
         errors.append(max(_product(seen * (one - first), seen * (two - second), energy), 1e-3 * tolerance))

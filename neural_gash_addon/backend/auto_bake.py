@@ -51,11 +51,9 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     if plan.method == "analytic":
         error = pilot.blocked if pilot is not None else 0.0
     if pilot is not None and tolerance is not None and found.scene is not None:
-        threads = threads or default_threads()
-        with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
-            asking = advice.inside_faces(mesh, found.scene, transfer.coefficients, order, tolerance, seed, pool,
-                                         threads)
-            record = record.also((yield from scaled(asking, 1, 0)))
+        asking = advice.inside_faces(mesh, found.scene, transfer.coefficients, order, tolerance, seed,
+                                     threads or default_threads())
+        record = record.also((yield from scaled(asking, 1, 0)))
     if pilot is not None:
         probes += pilot.traced
     return Transfer(transfer.coefficients, replace(record, probe_rays=probes, seconds=time.perf_counter() - began,

@@ -25,8 +25,8 @@ from .workers import default_threads
 FIRST_RAYS = 4        # of a bake to a tolerance, where nothing is known beforehand
 _LADDER = sorted([2 ** k for k in range(2, 13)] + [3 * 2 ** k for k in range(1, 11)])  # rays of one to a tolerance
 _TAKEN, _TAKES = 0.34, 0.225  # the error with 4 rays beside a plain bake's, and the power of rays by which it nears it
-_FALLS = 0.55         # the error falls as rays**-_FALLS, for saying how many rays more are wanted
-_STEP = 1.4, 4.0      # from a number of rays to the next, at least and at most
+_FALLS = 0.6          # the error falls as rays**-_FALLS, for saying how many rays more are wanted
+_STEP = 1.4, 2.0      # from a number of rays to the next, at least and at most
 _MARGIN = 0.92        # of the tolerance at which it stops: of several measures the first that is too low is met
 _DARE = 1.2           # times the tolerance are to be met by the first rays, where it is dear to have taken too many:
 _DEAR = 32            # with so many

@@ -28,7 +28,7 @@ from .workers import product
 _SAFE = 1.1                  # what the pilot's noise may be too low by
 _MARGIN = 0.95               # of a tolerance, for who measures it: the measure is a little too low where it stops
 _FEW_RAYS = (4, 6, 8, 12, 16, 24, 32, 48)  # of plain bakes below what an adaptive one takes at least
-_EMBREE_SECONDS, _HYBRID_SECONDS = 1e-3, 3e-3  # what a bake costs at all,
+_EMBREE_SECONDS, _HYBRID_SECONDS = 1e-3, 5e-3  # what a bake costs at all,
 _EMBREE_RAYS, _HYBRID_RAYS = 6.0, 10.0  # and at each point besides its rays, in rays
 SPARSE_POINTS = 1 << 16      # from which on a sparse bake is a candidate; below, too many are samples
 _SPARSE_SHARE = 0.15         # of the points that it then traces, about
