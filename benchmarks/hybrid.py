@@ -9,6 +9,8 @@ import argparse
 import csv
 import statistics
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -16,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 from meshes import FOLDER, read
 from scipy.stats import theilslopes
-from table import Table, seconds
+from table import Table, processor_seconds, seconds
 
 from neural_gash_addon.backend import methods, metrics
 from neural_gash_addon.backend import spherical_harmonics as sh
@@ -28,7 +30,8 @@ LADDER = (2, 3, 4, 6, 8, 12, 16, 24, 32)  # rays of the hybrid that are tried
 ORDER, REFERENCE_RAYS, REPEATS, TARGET = 3, 2048, 5, 0.5
 
 
-def curve(mesh: TriangleMesh, reference: np.ndarray, ladder: tuple[int, ...]) -> dict[str, list[tuple[float, float]]]:
+def curve(mesh: TriangleMesh, reference: np.ndarray, ladder: tuple[int, ...],
+          timed: Callable[[Callable[[], object]], float] = seconds) -> dict[str, list[tuple[float, float]]]:
     """(seconds, SRR) of both methods at each number of rays, measured in turns.
 
     Seconds are those of a line in the number of rays, fitted to the least of REPEATS at each (Theil and Sen):
@@ -42,7 +45,7 @@ def curve(mesh: TriangleMesh, reference: np.ndarray, ladder: tuple[int, ...]) ->
             for name, measured in runs.items():
                 kept: list[np.ndarray] = []
                 baking = methods.bake(mesh, name, ORDER, rays=rays, seed=seed)  # begins when it is run
-                spent = seconds(lambda baking=baking, kept=kept: kept.append(methods.run(baking).coefficients))
+                spent = timed(lambda baking=baking, kept=kept: kept.append(methods.run(baking).coefficients))
                 measured.append((spent, metrics.srr(kept[0], reference, unshadowed)))
         for name, measured in runs.items():
             found[name].append((min(t for t, _ in measured), statistics.median(s for _, s in measured)))
@@ -70,7 +73,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--folder", type=Path, default=FOLDER / "validation")
     parser.add_argument("--only", help="files whose name has this in it")
+    parser.add_argument("--processor", action="store_true",
+                        help="processor time, as it would pass on both threads of a machine that nobody else uses")
     arguments = parser.parse_args()
+    timed = partial(processor_seconds, threads=default_threads()) if arguments.processor else seconds
     categories = {}
     if (FOLDER / "MANIFEST.csv").is_file():
         with (FOLDER / "MANIFEST.csv").open(newline="") as file:
@@ -88,7 +94,7 @@ def main() -> None:
             continue
         mesh = read(path)
         reference = methods.run(methods.bake(mesh, "embree", ORDER, rays=REFERENCE_RAYS, seed=77)).coefficients
-        found = curve(mesh, reference, LADDER)
+        found = curve(mesh, reference, LADDER, timed)
         category = categories.get(path.stem, "")
         for budget in BUDGETS:
             spent, error = found["embree"][LADDER.index(budget)]

@@ -8,13 +8,15 @@ from __future__ import annotations
 import argparse
 import csv
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 from meshes import FOLDER, read
-from table import Table, seconds
+from table import Table, processor_seconds, seconds
 
 from neural_gash_addon.backend import conformal, methods, metrics, paper_bake, weights
 from neural_gash_addon.backend import spherical_harmonics as sh
@@ -59,7 +61,8 @@ def visibility_accuracy(mesh: TriangleMesh) -> float:
     return accuracy(logits > 0, torch.from_numpy(truth))
 
 
-def measure(mesh: TriangleMesh, unshadowed: np.ndarray, reference: np.ndarray
+def measure(mesh: TriangleMesh, unshadowed: np.ndarray, reference: np.ndarray,
+            timed: Callable[[Callable[[], object]], float] = seconds
             ) -> tuple[dict[str, float], dict[str, float], dict[str, np.ndarray]]:
     """SRR, µs a vertex (least of REPEATS, in turns), and errors (N, K) of the networks."""
     errors, spent, residuals = {}, {label(*column): [] for column in COLUMNS}, {}
@@ -70,7 +73,7 @@ def measure(mesh: TriangleMesh, unshadowed: np.ndarray, reference: np.ndarray
             kept: list[np.ndarray] = []
             baking = methods.bake(mesh, method, ORDER, rays=rays, seed=repeat)
             spent[label(method, rays)].append(
-                seconds(lambda baking=baking, kept=kept: kept.append(methods.run(baking).coefficients)))
+                timed(lambda baking=baking, kept=kept: kept.append(methods.run(baking).coefficients)))
             errors[label(method, rays)] = metrics.srr(kept[0], reference, unshadowed)
             if rays is None:
                 residuals[method] = kept[0] - reference
@@ -82,8 +85,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--folder", type=Path, default=FOLDER / "validation")
     parser.add_argument("--only", help="files whose name has this in it")
+    parser.add_argument("--processor", action="store_true",
+                        help="processor time, as it would pass on both threads of a machine that nobody else uses")
     parser.add_argument("--network", choices=NETWORKS, help="one of them alone")
     arguments = parser.parse_args()
+    timed = partial(processor_seconds, threads=default_threads()) if arguments.processor else seconds
     if arguments.network:
         NETWORKS[:] = [arguments.network]
         COLUMNS[:] = [column for column in COLUMNS if column[0] in ("embree", arguments.network)]
@@ -105,7 +111,7 @@ def main() -> None:
         mesh = read(path)
         unshadowed = sh.cosine_lobe(mesh.normals, ORDER)
         reference = methods.run(methods.bake(mesh, "embree", ORDER, rays=REFERENCE_RAYS, seed=77)).coefficients
-        errors, costs, residuals = measure(mesh, unshadowed, reference)
+        errors, costs, residuals = measure(mesh, unshadowed, reference, timed)
         category = categories.get(path.stem, "")
         found.append((category, errors, costs, residuals))
         if "gnn-paper" in NETWORKS:

@@ -19,6 +19,16 @@ def seconds(work: Callable[[], object]) -> float:
     return time.perf_counter() - began
 
 
+def processor_seconds(work: Callable[[], object], threads: int) -> float:
+    """What the clock would say of one call if nobody else used the machine: processor time of this thread, which waits
+    while others work for it, and that of the others, spread evenly over `threads`.
+    """
+    mine, every = time.thread_time(), time.process_time()
+    work()
+    mine, every = time.thread_time() - mine, time.process_time() - every
+    return mine + (every - mine) / threads
+
+
 def interleaved(reps: int, *works: Callable[[], float]) -> list[list[float]]:
     """Each work's own measurement, `reps` times, taken in turns so that a busy machine disturbs all alike."""
     out: list[list[float]] = [[] for _ in works]

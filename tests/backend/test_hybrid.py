@@ -187,6 +187,44 @@ def test_error_is_measured_and_a_tolerance_is_met(case):
     assert easy < hard
 
 
+def bent_sheet(points):
+    """A curl that shadows itself, of so many points and as many more as make its rows whole."""
+    t, x = np.meshgrid(np.linspace(0, 5, -(-points // 8)), np.linspace(-1, 1, 8), indexing="ij")
+    positions = np.stack([x, (1 + t / 8) * np.cos(t), (1 + t / 8) * np.sin(t)], -1).reshape(-1, 3)
+    i, j = (g.ravel() for g in np.meshgrid(np.arange(len(t) - 1), np.arange(7), indexing="ij"))
+    a, b, c, d = i * 8 + j, i * 8 + j + 1, (i + 1) * 8 + j + 1, (i + 1) * 8 + j
+    return TriangleMesh.from_triangles(positions, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]))
+
+
+def refuse(*_):
+    raise AssertionError("the network was asked")
+
+
+@pytest.mark.parametrize(("rays", "traced"), [(2, 4), (8, 16), (40, 64), (64, 64), (100, 100)])
+def test_of_few_points_more_rays_are_traced_and_no_network_is_asked(monkeypatch, rays, traced):
+    mesh = bent_sheet(hybrid_bake.FEWEST - 8)
+    monkeypatch.setattr(hybrid_bake, "filtered", refuse)
+    found = bake(mesh, rays=rays)
+    assert found.record.rays == traced * len(mesh.points)
+    np.testing.assert_allclose(found.coefficients, bake(mesh, "embree", traced).coefficients, atol=1e-6)
+
+
+def test_of_more_points_the_network_is_asked(monkeypatch):
+    monkeypatch.setattr(hybrid_bake, "filtered", refuse)
+    with pytest.raises(AssertionError, match="asked"):
+        bake(bent_sheet(hybrid_bake.FEWEST))
+
+
+def test_of_few_points_the_error_is_measured_too_and_a_tolerance_is_met():
+    mesh = bent_sheet(400)
+    truth = bake(mesh, "embree", 2048, seed=5).coefficients
+    for seed in range(3):
+        found = bake(mesh, seed=seed)
+        assert 0.6 < found.record.error_estimate / metrics.rel_l2(found.coefficients, truth) < 1.5
+    met = methods.run(methods.bake(mesh, "hybrid", 3, tolerance=0.05))
+    assert metrics.rel_l2(met.coefficients, truth) < 1.4 * 0.05
+
+
 def test_texels_learn_from_the_grid():
     mesh = surface(shapes.torus())
     truth = methods.run(texture.bake(mesh, "embree", 3, side=64, rays=1024, seed=8))
