@@ -16,7 +16,7 @@ from .backend.errors import UserError
 from .backend.transfer import Transfer
 from .cli_files import choose, save_file, set_number
 from .ops.batch import Batch, Outcome, finish_batch, prepare_batch
-from .properties import COLLECTION, DENSITY, FIT, RAYS, RESOLUTION, TEXTURE, TOLERANCE, VERTICES
+from .properties import COLLECTION, DENSITY, FIT, NETWORK, PATHS, RAYS, RESOLUTION, TEXTURE, TOLERANCE, VERTICES
 from .scene.read import make_applied_copy
 from .scene.render import render_preview
 from .scene.views import LIT
@@ -31,7 +31,7 @@ def check_bake(arguments: argparse.Namespace) -> None:
         raise UserError("With --uv-map a texture has no texels per metre; give --texture a number of texels, or fit.")
     if arguments.gloss and (arguments.texture is None or arguments.bounces):
         raise UserError("--gloss belongs to a bake with --texture and without --bounces.")
-    if arguments.gloss and arguments.lamps:
+    if arguments.gloss and (arguments.lamps or arguments.lamps_network):
         raise UserError("--gloss shows no lamps; leave out one of --gloss and --lamps.")
     if not methods.METHODS[arguments.method].traces and (arguments.rays is not None or arguments.bounces):
         raise UserError(f"The method '{arguments.method}' traces nothing; leave out --rays and --bounces.")
@@ -68,7 +68,8 @@ def prepare_bake(arguments: argparse.Namespace, objects: list[bpy.types.Object],
         if settings.collection is None:
             raise UserError(f"There is no collection named '{arguments.occluders}' in the file.")
     set_number(settings, "bounces", arguments.bounces)
-    settings.lamps = arguments.lamps
+    settings.lamps = arguments.lamps or arguments.lamps_network
+    settings.lamps_by = NETWORK if arguments.lamps_network else PATHS
     if arguments.texture is not None:
         settings.target = TEXTURE
         settings.sizing, size = arguments.texture

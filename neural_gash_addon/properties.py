@@ -30,6 +30,7 @@ from .scene.views import COEFFICIENT, LIT, OCCLUSION
 
 RAYS, TOLERANCE, COLLECTION = "RAYS", "TOLERANCE", "COLLECTION"
 VERTICES, TEXTURE = "VERTICES", "TEXTURE"
+PATHS, NETWORK = "PATHS", "NETWORK"
 RESOLUTION, DENSITY, FIT = "RESOLUTION", "DENSITY", "FIT"
 
 
@@ -113,6 +114,11 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
         name="Lamps", default=False,
         description="Bake the light of lamps and of materials that emit, too, with what all surfaces reflect of it in "
                     "their colours. It is of everything that is visible, as it stands; spot lamps are left out")
+    lamps_by: EnumProperty(  # type: ignore[valid-type]
+        name="Lamps by", description="How the light of lamps is found", default=PATHS,
+        items=[(PATHS, "Path Tracing", "Paths from every point, as many as the tolerance asks for"),
+               (NETWORK, "Network (PyTorch)", "Direct light is traced; what surfaces reflect is traced at some "
+                "thousand points, and a network says from them what it is anywhere. For rooms of up to 20 m")])
     target: EnumProperty(  # type: ignore[valid-type]
         name="Target", description="Where the bake is kept", default=VERTICES,
         items=[(VERTICES, "Vertices", "Numbers at the vertices: quick, and enough for dense meshes"),

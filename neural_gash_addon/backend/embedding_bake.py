@@ -44,13 +44,28 @@ def network() -> Any:
     return model.to("cuda" if torch.cuda.is_available() else "cpu").eval()
 
 
+def encoded(scene: LitScene, *, seed: int = 0, threads: int | None = None, occluders: Occluders | None = None
+            ) -> Generator[float, None, Room | None]:
+    """A scene's room, to be asked by `irradiance` any number of times; None where no surface has an area.
+
+    Raises:
+        UserError: no torch or weights, or a room larger than the network knows.
+    """
+    refuse_larger(scene.positions[scene.triangles])
+    model = network()
+    lit = yield from lit_points(scene, occluders or scene.occluders(), seed=seed, threads=threads)
+    return Room(model, lit) if len(lit.places) else None
+
+
 def irradiance(scene: LitScene, points: NDArray, normals: NDArray, *, seed: int = 0, threads: int | None = None,
-         occluders: Occluders | None = None) -> Generator[float, None, Irradiance]:
+               occluders: Occluders | None = None, clearance: NDArray | None = None, room: Room | None = None
+               ) -> Generator[float, None, Irradiance]:
     """Light that arrives at points, as `irradiance.irradiance` gives it: direct light traced, reflected light learned.
 
     Args:
         points: (N, 3) metres. normals: (N, 3) unit; where it is zero, the irradiance is.
-        occluders: `scene.occluders()`, if it is there already.
+        occluders: `scene.occluders()`, if it is there already. clearance: (N, 3), as `irradiance.irradiance`.
+        room: of the scene, if it is there already.
     Returns:
         `error` is that of direct light, by its paths, and of reflected light, by how far off the network is at CHECKED
         of the points: one share of all values.
@@ -63,21 +78,20 @@ def irradiance(scene: LitScene, points: NDArray, normals: NDArray, *, seed: int 
     if not len(scene.emitters):
         values, error = np.zeros((2, len(points), 3), np.float32)
         return Irradiance(values, error, tracing.DARK)
-    refuse_larger(scene.positions[scene.triangles])
-    model = network()
     occluders = occluders or scene.occluders()
+    clearance = normals if clearance is None else clearance
 
     def traced(rows: NDArray, rays: int, straight: bool, start: float, share: float
                ) -> Generator[float, None, Irradiance]:
         return (yield from scaled(tracing.irradiance(
             scene, points[rows], normals[rows], rays, depth=1 if straight else tracing.DEPTH, straight=straight,
-            seed=seed + 1, threads=threads, occluders=occluders), start, share))
+            seed=seed + 1, threads=threads, occluders=occluders, clearance=clearance[rows]), start, share))
 
-    direct = yield from traced(np.arange(len(points)), STRAIGHT, True, 0.0, 0.3)
-    lit = yield from scaled(lit_points(scene, occluders, seed=seed, threads=threads), 0.3, 0.3)
-    if not len(lit.places):
+    if room is None:
+        room = yield from scaled(encoded(scene, seed=seed, threads=threads, occluders=occluders), 0.0, 0.3)
+    direct = yield from traced(np.arange(len(points)), STRAIGHT, True, 0.3, 0.3)
+    if room is None:
         return direct
-    room = Room(model, lit)
     found = yield from scaled(room.reflected(points, normals, direct.values), 0.6, 0.3)
     facing = np.flatnonzero(normals.any(1))
     checked = np.random.default_rng([seed, 11]).permutation(facing)[:CHECKED]

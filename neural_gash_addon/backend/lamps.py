@@ -7,9 +7,11 @@ import time
 from collections.abc import Generator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
+from . import embedding_bake
 from .geometry import TriangleMesh
 from .irradiance import BATCHES, Irradiance, irradiance
 from .lit_scene import LitScene
@@ -32,6 +34,8 @@ class Lamps:
     notice: str = ""          # what of the lamps is not in it
     rays: int | None = None   # paths from every point, or
     tolerance: float | None = None  # relative L2 error to reach
+    learned: bool = False     # what surfaces reflect is the network's, of which direct light is traced; needs torch
+    _room: Any = None         # embedding_bake.Room, once it has been encoded
 
     @cached_property
     def _occluders(self) -> Occluders:
@@ -41,13 +45,30 @@ class Lamps:
             ) -> Generator[float, None, Transfer]:
         """The transfer of a mesh's points with the irradiance at them."""
         began = time.perf_counter()
-        found, rays = yield from self._traced(mesh, seed, threads)
+        found, rays = yield from (self._predicted if self.learned else self._traced)(mesh, seed, threads)
         record = replace(transfer.record, lamps=self.key, lamps_rays=rays * len(mesh.points),
                          lamps_error=relative(found),
                          lamps_notice=" ".join(filter(None, (found.notice, self.notice))),
                          basis=transfer.record.basis + LAMPS_BASIS,
                          seconds=transfer.record.seconds + time.perf_counter() - began)
         return replace(transfer, irradiance=found.values, record=record)
+
+    def _predicted(self, mesh: TriangleMesh, seed: int, threads: int | None
+                   ) -> Generator[float, None, tuple[Irradiance, int]]:
+        """Irradiance by the light-transport embedding, and the paths of its direct light. As good as it gets: the
+        error is measured, and not brought to a tolerance.
+        """
+        start = 0.0
+        if self._room is None and len(self.scene.emitters):
+            start = 0.4
+            self._room = yield from scaled(embedding_bake.encoded(
+                self.scene, seed=seed, threads=threads, occluders=self._occluders), 0.0, start)
+        found = yield from scaled(embedding_bake.irradiance(
+            self.scene, mesh.points, mesh.normals, seed=seed, threads=threads, occluders=self._occluders,
+            clearance=mesh.clearance, room=self._room), start, 1 - start)
+        if self.tolerance is not None and relative(found) > self.tolerance:
+            found = replace(found, notice="The network's error is above the tolerance; by paths it would be met.")
+        return found, embedding_bake.STRAIGHT
 
     def _traced(self, mesh: TriangleMesh, seed: int, threads: int | None
                 ) -> Generator[float, None, tuple[Irradiance, int]]:

@@ -37,6 +37,7 @@ def scene_points(scene: LitScene, count: int, seed: int = 0) -> NDArray[np.float
     shining = np.zeros(len(scene.areas), bool)
     shining[scene.emitters] = True
     weights = np.where(shining, EMITTERS, 1.0)
+    weights[len(weights) - scene.bodiless:] = 0  # no surfaces
     cumulative = np.cumsum(scene.areas * weights ** 2)
     if not cumulative[-1] > 0:
         return np.zeros((0, 12), np.float32)

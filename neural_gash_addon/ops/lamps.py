@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..backend.lamps import Lamps
-from ..properties import NeuralGashSettings
+from ..properties import NETWORK, NeuralGashSettings
 from ..scene.lamps import LitScenes
 
 
@@ -13,11 +13,12 @@ class LampReader:
     """What lights the objects of a batch; one for all that see the same, which share its preparations."""
 
     def __init__(self, depsgraph: bpy.types.Depsgraph, settings: NeuralGashSettings) -> None:
-        self._tracing = settings.tracing() or {"tolerance": settings.tolerance}
+        self._how = {**(settings.tracing() or {"tolerance": settings.tolerance}),
+                     "learned": settings.lamps_by == NETWORK}
         self._scenes = LitScenes(depsgraph)
         self._known: dict[str, Lamps] = {}
 
     def of(self, obj: bpy.types.Object) -> Lamps:
         """The lamps of an object. Raises UserError as `read_lamps`."""
         scene, key, notice = self._scenes.of(obj)
-        return self._known.setdefault(key, Lamps(scene, key, notice, **self._tracing))
+        return self._known.setdefault(key, Lamps(scene, key, notice, **self._how))

@@ -195,6 +195,8 @@ class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):
         if METHODS[settings.method].traces:
             layout.prop(settings, "bounces")
         layout.prop(settings, "lamps")
+        if settings.lamps:
+            layout.prop(settings, "lamps_by")
         if settings.lamps and not METHODS[settings.method].traces:
             layout.prop(settings, "tolerance")
         layout.prop(settings, "target", expand=True)

@@ -72,6 +72,14 @@ def test_without_the_flag_there_is_none(lit, run, tmp_path):
         assert "irradiance" not in data.files
 
 
+def test_the_network_is_asked_for_by_a_flag(lit, run):
+    pytest.importorskip("torch", reason="the network needs torch")
+    done = run("bake", lit, "--lamps-network", "--method", "analytic", "--json")
+    assert done.returncode == 0, done
+    printed = json.loads(done.stdout.splitlines()[-1])
+    assert printed["lamps_error"] > 0 and printed["lamps_rays"] == 128 * printed["points"]
+
+
 def test_textures_have_one_more(lit, run, tmp_path):
     done = run("bake", lit, "--lamps", "--rays", 8, "--texture", 16, "--textures", tmp_path)
     assert done.returncode == 0 and "lamps with 8 paths a point" in done.stdout, done
