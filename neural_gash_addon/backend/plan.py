@@ -102,8 +102,8 @@ def plans(found: Pilot, points: int, tolerance: float) -> list[Plan]:
     if enough:
         out.append(Plan("embree", rays=enough[0], reason=f"Shadows are {_percent(found.blocked)} of the whole, so "
                         f"{enough[0]} rays a point are enough for {_percent(tolerance)}."))
-    out.append(Plan("hybrid", tolerance=tolerance, reason=f"{expected_rays(found, tolerance)} rays a point, averaged "
-                    f"over neighbours by the network, are enough for {_percent(tolerance)}."))
+    out.append(Plan("hybrid", tolerance=tolerance, reason="Few rays, averaged over neighbours by the network, are the "
+                                                          f"quickest way to {_percent(tolerance)}."))
     if points >= SPARSE_POINTS:
         out.append(Plan("sparse", tolerance=measured, reason=f"{points:,} points are dense: some are traced, and the "
                                                               "others read off them."))
