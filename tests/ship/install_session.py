@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Run by test_ship.py alone: install the zip, bake with the wheels in it, disable. Argument: the zip."""
 import importlib.util
+import json
 import sys
 
 import bpy
@@ -53,7 +54,7 @@ bpy.context.scene.neural_gash.order = 4
 assert bpy.ops.neural_gash.bake() == {"FINISHED"}
 attributes = [name for name, _ in bpy.context.object.data.attributes.items() if name.startswith("_prt_")]
 assert attributes == [f"_prt_{i}" for i in range(4)], attributes
-assert "embree" in bpy.context.object.data["neural_gash"]
+assert json.loads(bpy.context.object.data["neural_gash"])["rays"] > 0  # whichever method was planned
 settings = bpy.context.scene.neural_gash
 settings.target, settings.side, settings.order, settings.bounces = "TEXTURE", 64, 3, 2
 assert bpy.ops.neural_gash.bake() == {"FINISHED"}   # with xatlas, and embreex's hits
