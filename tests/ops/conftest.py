@@ -89,22 +89,39 @@ def snapshot():
     return take
 
 
-@pytest.fixture
-def wing(make, settings):
-    """A sheet that folds up by a shape key, from frame 1 to frame 10; baked, at frame 1."""
-    import bpy
-    line = np.linspace(-1, 1, 25)
-    positions = [(x, y, 0) for y in line for x in line]
-    faces = [(j * 25 + i, j * 25 + i + 1, (j + 1) * 25 + i + 1, (j + 1) * 25 + i) for j in range(24) for i in range(24)]
-    obj = make(positions, faces, "Wing", smooth=True)
+def folding(make, name, cells, last):
+    """A smooth sheet of cells x cells that folds up by a shape key, from frame 1 to the last."""
+    line, side = np.linspace(-1, 1, cells + 1), cells + 1
+    positions = [(x, y, 0.0) for y in line for x in line]
+    faces = [(j * side + i, j * side + i + 1, (j + 1) * side + i + 1, (j + 1) * side + i)
+             for j in range(cells) for i in range(cells)]
+    obj = make(positions, faces, name, smooth=True)
     obj.shape_key_add(name="Basis")
     key = obj.shape_key_add(name="Up")
     for point, (x, y, _) in zip(key.data, positions, strict=True):
         point.co = (0.35 * x, y, 0.9 * x) if x > 0 else (x, y, 0)
-    for frame, value in ((1, 0.0), (10, 1.0)):
+    for frame, value in ((1, 0.0), (last, 1.0)):
         key.value = value
         key.keyframe_insert("value", frame=frame)
+    return obj
+
+
+@pytest.fixture
+def wing(make, settings):
+    """A sheet that folds up from frame 1 to frame 10; baked, at frame 1."""
+    import bpy
+    obj = folding(make, "Wing", 24, 10)
     bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 4
     bpy.context.scene.frame_set(1)
     assert bpy.ops.neural_gash.bake() == {"FINISHED"}
     return obj
+
+
+@pytest.fixture
+def sheet(make, settings):
+    """sheet(name): one that folds up from frame 1 to frame 3; not baked."""
+    import bpy
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end = 1, 3
+    scene.frame_set(1)
+    return lambda name="Sheet": folding(make, name, 8, 3)
