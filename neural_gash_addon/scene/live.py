@@ -283,6 +283,8 @@ def play(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> list[bpy.typ
 @persistent
 def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Follow what was posed, edited or moved."""
+    if not _rendering:
+        renders.show_all()
     if _suspended or not scene.neural_gash.live:
         return
     changed = {update.id.original.session_uid for update in depsgraph.updates
@@ -303,6 +305,8 @@ def _on_frame(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
         written = play(scene, depsgraph) + follow(scene, depsgraph, bpy.app.background or _rendering)
         if _rendering:
             renders.show_what_fits(scene, depsgraph, _problems)
+        else:
+            renders.show_all()
         _animate_again(scene, depsgraph, written)
 
 
@@ -327,9 +331,7 @@ def _on_rendered(*_: object) -> None:
     global _rendering
     _rendering = False
     if bpy.app.background:
-        renders.show_all()
-    elif not bpy.app.timers.is_registered(renders.show_all):
-        bpy.app.timers.register(renders.show_all)  # renders of a window end in a thread of their own
+        renders.show_all()  # renders of a window end in a thread of their own: the next update is the window's
 
 
 @persistent
@@ -354,8 +356,6 @@ def unregister() -> None:
     global _rendering
     for name, handler in _HANDLERS:
         getattr(bpy.app.handlers, name).remove(handler)
-    if bpy.app.timers.is_registered(renders.show_all):
-        bpy.app.timers.unregister(renders.show_all)
     renders.show_all()
     _on_load()
     _rendering = False

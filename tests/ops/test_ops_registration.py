@@ -28,9 +28,8 @@ def test_twice_leaves_nothing(addon):
         assert hasattr(bpy.types.Scene, "neural_gash")
         addon.unregister()
         assert _registered() == before
-    from neural_gash_addon.scene import rendered, staleness
-    for timer in (staleness._compare_changed, rendered.show_all):
-        assert not bpy.app.timers.is_registered(timer)
+    from neural_gash_addon.scene import staleness
+    assert not bpy.app.timers.is_registered(staleness._compare_changed)
     addon.register()
 
 
