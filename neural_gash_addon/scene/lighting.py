@@ -122,12 +122,13 @@ def _on_light(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Follow the World, the suns and the image of the World, where a preview shows them."""
     if _LIGHT not in scene or scene.neural_gash.light_source not in (WORLD, SUNS):
         return  # a scene from which no light was taken may yet have objects of one from which it was
-    changed = [update.id.original for update in depsgraph.updates]
+    # as evaluated: the original of a preview's material may have been removed by a handler before this one
+    changed = [update.id for update in depsgraph.updates]
     if not any(map(_may_light, changed)):
         return
     for image in changed:
         if isinstance(image, bpy.types.Image):
-            forget_image(image)
+            forget_image(image.original)
     if any(map(is_on, scene.objects)):
         follow_light(scene, depsgraph)
 

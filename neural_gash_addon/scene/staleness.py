@@ -99,7 +99,7 @@ def _on_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
             if isinstance(update.id, bpy.types.Object)
             and (update.is_updated_geometry or update.is_updated_transform)}
     if any(isinstance(update.id, bpy.types.Light)
-           or isinstance(update.id, bpy.types.Material) and not is_preview(update.id.original)
+           or isinstance(update.id, bpy.types.Material) and not is_preview(update.id)
            for update in depsgraph.updates):
         uids.update(obj.session_uid for obj in scene.objects if _reflects(obj))
     if uids:
