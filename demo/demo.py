@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import bpy
@@ -110,9 +111,14 @@ def main() -> None:
         print(f"  {out / name}")
 
 
-if __name__ == "__main__":
+def run(main: Callable[[], None]) -> None:
+    """Run a demo with the add-on registered."""
     neural_gash_addon.register()
     try:
         main()
     finally:
         neural_gash_addon.unregister()
+
+
+if __name__ == "__main__":
+    run(main)

@@ -12,7 +12,6 @@ from pathlib import Path
 import bpy
 
 import demo
-import neural_gash_addon
 from neural_gash_addon.scene.render import render_pixels, silent_blender
 
 VIEW = {"direction": (0.5, -1.0, 0.5), "resolution": (520, 420), "samples": 16}
@@ -72,8 +71,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    neural_gash_addon.register()
-    try:
-        main()
-    finally:
-        neural_gash_addon.unregister()
+    demo.run(main)

@@ -16,7 +16,6 @@ import numpy as np
 from mathutils import Matrix
 
 import demo
-import neural_gash_addon
 from neural_gash_addon.ops.job import summary
 from neural_gash_addon.scene.attributes import read_record
 from neural_gash_addon.scene.preview import preview_off
@@ -160,8 +159,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    neural_gash_addon.register()
-    try:
-        main()
-    finally:
-        neural_gash_addon.unregister()
+    demo.run(main)

@@ -13,7 +13,6 @@ import bpy
 import numpy as np
 
 import demo
-import neural_gash_addon
 from neural_gash_addon.ops.job import summary
 from neural_gash_addon.scene.attributes import read_record
 from neural_gash_addon.scene.render import render_pixels, silent_blender
@@ -74,8 +73,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    neural_gash_addon.register()
-    try:
-        main()
-    finally:
-        neural_gash_addon.unregister()
+    demo.run(main)

@@ -125,3 +125,14 @@ def sheet(make, settings):
     scene.frame_start, scene.frame_end = 1, 3
     scene.frame_set(1)
     return lambda name="Sheet": folding(make, name, 8, 3)
+
+
+@pytest.fixture
+def floor(make, settings):
+    """A white floor; bakes are quick, with lamps."""
+    from .lit import FLOOR, paint
+    obj = make(*FLOOR, "Floor", smooth=True)
+    paint(obj)
+    settings.lamps, settings.method, settings.quality, settings.tolerance = True, "analytic", "TOLERANCE", 0.02
+    settings.light_source, settings.sky = "SKY", (0, 0, 0)
+    return obj

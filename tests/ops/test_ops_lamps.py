@@ -2,74 +2,18 @@
 """Lamps through the Bake operator: numbers, picture, staleness, clear, textures, sets, what is said."""
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
-from .conftest import CUBE
+from .lit import GRID, PANEL, area, attribute, bake, paint, record
 
 bpy = pytest.importorskip("bpy")
-
-GRID = 16
-FLOOR = ([(x / GRID * 2 - 1, y / GRID * 2 - 1, 0) for y in range(GRID + 1) for x in range(GRID + 1)],
-         [(i + j * (GRID + 1), i + 1 + j * (GRID + 1), i + 1 + (j + 1) * (GRID + 1), i + (j + 1) * (GRID + 1))
-          for j in range(GRID) for i in range(GRID)])
-PANEL = ([(-0.4, -0.4, 1), (-0.4, 0.4, 1), (0.4, 0.4, 1), (0.4, -0.4, 1)], [(0, 1, 2, 3)])
-
-
-def paint(obj, colour=(0.8, 0.8, 0.8), emission=(0, 0, 0), strength=0.0):
-    material = bpy.data.materials.new(obj.name)
-    material.use_nodes = True
-    shader = material.node_tree.nodes["Principled BSDF"]
-    shader.inputs["Specular IOR Level"].default_value = 0
-    shader.inputs["Base Color"].default_value = (*colour, 1)
-    shader.inputs["Emission Color"].default_value = (*emission, 1)
-    shader.inputs["Emission Strength"].default_value = strength
-    obj.data.materials.append(material)
-    return shader
-
-
-def area(energy=20.0, location=(0, 0, 1), size=0.8):
-    data = bpy.data.lights.new("Lamp", "AREA")
-    data.energy, data.size, data.spread = energy, size, math.pi
-    obj = bpy.data.objects.new("Lamp", data)
-    obj.location = location
-    bpy.context.scene.collection.objects.link(obj)
-    bpy.context.view_layer.update()
-    return obj
-
-
-def bake():
-    assert bpy.ops.neural_gash.bake() == {"FINISHED"}
-
-
-def attribute(obj, name="_prt_lamps"):
-    values = np.empty((len(obj.data.attributes[name].data), 4), np.float32)
-    obj.data.attributes[name].data.foreach_get("color", values.ravel())
-    return values[:, :3]
-
-
-def record(obj):
-    from neural_gash_addon.scene.attributes import read_record
-    return read_record(obj)
-
 
 def square(size, distance):
     """Form factor of a square over a parallel element under its centre (Howell 1982)."""
     a = size / 2 / distance
     x = np.hypot(1, a)
     return 4 * (a / x * np.arctan(a / x) * 2) / (2 * np.pi)
-
-
-@pytest.fixture
-def floor(make, settings):
-    """A white floor; bakes are quick, with lamps."""
-    obj = make(*FLOOR, "Floor", smooth=True)
-    paint(obj)
-    settings.lamps, settings.method, settings.quality, settings.tolerance = True, "analytic", "TOLERANCE", 0.02
-    settings.light_source, settings.sky = "SKY", (0, 0, 0)
-    return obj
 
 
 def picture(objects, camera=True, size=96):
@@ -415,56 +359,3 @@ def test_the_scene_is_read_once_for_all_that_are_baked_together(floor, make, set
     staleness._changed.update(obj.session_uid for obj in objects)
     staleness._compare_changed()
     assert len(times) == 1 and all(staleness._known[obj.session_uid] == "CURRENT" for obj in objects)
-
-
-@pytest.fixture
-def room(floor, make):
-    """The floor within a closed box of two colours, under an area lamp."""
-    box = make([(x, y, z) for z in (-0.01, 2) for y in (-1.01, 1.01) for x in (-1.01, 1.01)], CUBE[1], "Box")
-    paint(box, (0.7, 0.3, 0.2))
-    box.select_set(False)
-    area(energy=20, location=(0.3, 0, 1.9), size=0.4)
-    bpy.context.view_layer.objects.active = floor
-    floor.select_set(True)
-    return floor
-
-
-@pytest.mark.parametrize("target", ["VERTICES", "TEXTURE"])
-def test_the_network_is_like_tracing_and_encodes_a_scene_once(room, settings, monkeypatch, target):
-    pytest.importorskip("torch", reason="the network needs torch")
-    from neural_gash_addon.backend import embedding_bake
-    from neural_gash_addon.scene.attributes import read_record
-    from neural_gash_addon.scene.images import bake_images
-
-    def baked():
-        bake()
-        if target == "VERTICES":
-            return attribute(room)
-        image = bake_images(room.data, read_record(room))[-1]
-        values = np.empty(32 * 32 * 4, np.float32)
-        image.pixels.foreach_get(values)
-        return values.reshape(-1, 4)[:, :3]
-
-    calls, real = [], embedding_bake.encoded
-    monkeypatch.setattr(embedding_bake, "encoded", lambda *a, **k: calls.append(1) or real(*a, **k))
-    settings.target, settings.side = target, 32
-    truth = baked()
-    assert not calls
-    settings.lamps_by = "NETWORK"
-    found = baked()
-    assert calls == [1]
-    assert 0 < np.linalg.norm(found - truth) < 0.12 * np.linalg.norm(truth)
-    told = record(room)
-    assert told.lamps_error > 0.02 and "above the tolerance" in told.lamps_notice
-    settings.tolerance = 0.5
-    bake()
-    assert not record(room).lamps_notice
-
-
-def test_a_room_that_the_network_does_not_know_is_refused(room, settings, refused):
-    pytest.importorskip("torch", reason="the network needs torch")
-    settings.lamps_by = "NETWORK"
-    bpy.data.objects["Box"].scale = (12, 1, 1)
-    bpy.context.view_layer.update()
-    assert "24.2 m long" in refused(bpy.ops.neural_gash.bake)
-    assert "_prt_lamps" not in room.data.attributes

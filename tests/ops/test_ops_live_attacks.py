@@ -5,37 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from .moving import bake, quiet, select, stored, truth
+
 bpy = pytest.importorskip("bpy")
 
-from neural_gash_addon.backend import methods  # noqa: E402
-from neural_gash_addon.scene import attributes, live, preview, read, rendered, staleness  # noqa: E402
-
-
-def stored(obj):
-    """(E, K) as the attributes have it."""
-    return attributes.read_transfer(obj)[0]
-
-
-def truth(obj, settings):
-    """(N, K) of the object as it stands."""
-    mesh = read.read_object(obj, bpy.context.evaluated_depsgraph_get()).mesh
-    return methods.run(methods.bake(mesh, settings.method, settings.order, **settings.tracing())).coefficients
-
-
-def select(*objects):
-    for obj in objects:
-        obj.select_set(True)
-    bpy.context.view_layer.objects.active = objects[0]
-
-
-def bake(*objects):
-    select(*objects)
-    assert bpy.ops.neural_gash.bake() == {"FINISHED"}
-
-
-def quiet(capfd):
-    out, err = capfd.readouterr()
-    assert "Traceback" not in out + err, out + err
+from neural_gash_addon.scene import live, preview, rendered, staleness  # noqa: E402
 
 
 def test_nan_and_zero_scale(sheet, settings, capfd):

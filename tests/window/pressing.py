@@ -46,17 +46,10 @@ def found(s, wanted: str, places: list):
 
 def click(s, wanted: str):
     """Press a button of the panel."""
-    places: list = []
-    yield from found(s, wanted, places)
-    window = panel(s)[0]
-    for x, y in places:
-        window.event_simulate("LEFTMOUSE", "PRESS", x=x, y=y)
-        yield _SETTLE
-        window.event_simulate("LEFTMOUSE", "RELEASE", x=x, y=y)
-        yield _SETTLE
+    yield from drag(s, wanted, 0)
 
 
-def drag(s, wanted: str, width: int, during):
+def drag(s, wanted: str, width: int, during=lambda: None):
     """Drag a slider of the panel to the right, by some pixels; `during()` is called at each step."""
     places: list = []
     yield from found(s, wanted, places)
@@ -69,4 +62,4 @@ def drag(s, wanted: str, width: int, during):
             yield _SETTLE
             during()
         window.event_simulate("LEFTMOUSE", "RELEASE", x=x + width, y=y)
-        yield 0.2
+        yield _SETTLE
