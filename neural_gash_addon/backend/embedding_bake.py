@@ -2,7 +2,8 @@
 """Irradiance in a room by the light-transport embedding: encode the room once, then ask for any points. Needs torch.
 
 Light straight from emitters is path traced at each point, where it has little noise. What was reflected is traced at
-scene points alone, with few paths, and the network says from them what it is anywhere.
+scene points alone, with few paths, and the network says from them what it is anywhere, but for gaps between things
+that are narrower than its codes are apart: there, it is traced too.
 """
 from __future__ import annotations
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from . import embedding, weights
 from . import irradiance as tracing
+from .enclosed import NEAR, enclosed
 from .errors import UserError
 from .geometry import NOT_FINITE
 from .irradiance import Irradiance
@@ -27,6 +29,7 @@ from .raycast import Occluders
 STRAIGHT = 128                  # paths for light straight from emitters: what they cost is about what decoding does
 QUERIES_AT_ONCE = 4096          # decoded together, so that memory does not grow with their number
 CHECKED, CHECKS = 128, 1024     # points whose reflected light is traced as well, to know the error; paths of each
+ENCLOSED = 512                  # paths for reflected light at points in gaps, where the network is not asked
 
 
 def network() -> Any:
@@ -68,7 +71,7 @@ def irradiance(scene: LitScene, points: NDArray, normals: NDArray, *, seed: int 
         room: of the scene, if it is there already.
     Returns:
         `error` is that of direct light, by its paths, and of reflected light, by how far off the network is at CHECKED
-        of the points: one share of all values.
+        of the points: one share of all values; at those in gaps (`enclosed`), by their paths.
     Raises:
         UserError: no torch or weights, points that are not finite, or a room larger than the network knows.
     """
@@ -92,12 +95,15 @@ def irradiance(scene: LitScene, points: NDArray, normals: NDArray, *, seed: int 
     direct = yield from traced(np.arange(len(points)), STRAIGHT, True, 0.3, 0.3)
     if room is None:
         return direct
-    found = yield from scaled(room.reflected(points, normals, direct.values), 0.6, 0.3)
-    facing = np.flatnonzero(normals.any(1))
-    checked = np.random.default_rng([seed, 11]).permutation(facing)[:CHECKED]
+    found = yield from scaled(room.reflected(points, normals, direct.values), 0.6, 0.2)
+    within = enclosed(points, normals, clearance, NEAR * room.spacing(points), occluders, seed)
+    gaps, others = np.flatnonzero(within), np.flatnonzero(~within & normals.any(1))
+    paths = yield from traced(gaps, ENCLOSED, False, 0.8, 0.1)
+    checked = np.random.default_rng([seed, 11]).permutation(others)[:CHECKED]
     truth = yield from traced(checked, CHECKS, False, 0.9, 0.1)
-    error = np.hypot(direct.error, _share_off(found[checked], truth) * found).astype(np.float32)
-    return Irradiance(direct.values + found, error)
+    error = _share_off(found[checked], truth) * found
+    found[gaps], error[gaps] = paths.values, paths.error
+    return Irradiance(direct.values + found, np.hypot(direct.error, error).astype(np.float32))
 
 
 def _share_off(found: NDArray, truth: Irradiance) -> float:
@@ -164,6 +170,10 @@ class Room:
             yield min(rows.stop / len(points), 1.0)
         out[~np.any(normals, axis=1)] = 0
         return out
+
+    def spacing(self, points: NDArray) -> NDArray[np.float32]:
+        """(N,) metres between codes, about, at points (N, 3)."""
+        return self._frame.spacing.cpu().numpy()[nearest_to(points, self._anchors, 1)[:, 0]]
 
     def _tensor(self, array: NDArray) -> Any:
         import torch
