@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from . import sampling
 from .raycast import Occluders
 
-NEAR = 0.5    # of the distance between codes: what is nearer stands between the point and the codes about it
-SHARE = 0.4   # of the sky, by cosine, that is so near; beside a wall it is less than a half, and mostly less than this
+NEAR = 1.0    # of the distance between codes: what is nearer stands between the point and the codes about it
+SHARE = 0.4   # of the sky, by cosine, that is so near; in a corner of a room it is a half at most
 _LOOKS = 16   # rays from a point
 _SETS = 16
 _AT_ONCE = 1 << 15  # points, so that memory does not grow with their number
