@@ -123,9 +123,7 @@ def asked(scene: LitScene, where: Callable[[NDArray], NDArray] | None = None) ->
 
 
 class Answers:
-    """All light at queries of a scene: the truth, the network's (as a bake has it, and without tracing in gaps), and the
-    mean of scene points.
-    """
+    """All light at queries of a scene: the truth, the network's (as a bake has it, and alone), the mean of scene points."""
 
     def __init__(self, model, scene: LitScene, queries: NDArray) -> None:
         places, normals, occluders = queries[:, :3], queries[:, 3:6], scene.occluders()
