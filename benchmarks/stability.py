@@ -19,6 +19,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
+import trials_rooms
 import trials_scene
 import trials_surface
 from chart_measure import about
@@ -215,11 +216,15 @@ def main() -> int:
     if not arguments.only and not results["noise"]:
         results["noise"] = {**about(), "rows": noise(scale, chosen)}
         _save(arguments.out, results)
-    parts = [*results["trials"].values(), *([results["noise"]] if results["noise"] else [])]
+    if not arguments.only and not results.get("rooms"):
+        results["rooms"] = {**about(), "rows": trials_rooms.tried(8 if arguments.quick else 1)}
+        _save(arguments.out, results)
+    parts = [part for part in (*results["trials"].values(), results["noise"], results.get("rooms")) if part]
     machines, commits = (", ".join(sorted({part[name] for part in parts})) for name in ("machine", "commit"))
     cells = [Cell(**cell) for _, trial in trials for cell in results["trials"][trial.__name__]["cells"]]
     texts = {"origin": f"Machine: {machines}. Commit: {commits}. Seed 0; {REFERENCE_SEED} of the references.",
-             "table": table(cells), "noise": noise_table(results["noise"].get("rows", [])), "red": red_list(cells)}
+             "table": table(cells), "noise": noise_table(results["noise"].get("rows", [])), "red": red_list(cells),
+             "rooms": trials_rooms.table(results.get("rooms", {}).get("rows", []))}
     if arguments.page:
         fill(arguments.page, texts)
     print("\n\n".join(texts.values()))
