@@ -58,7 +58,8 @@ def _parser() -> argparse.ArgumentParser:
     bake.add_argument("--lamps", action="store_true", help="bake the light of lamps and emissive materials "
                       "too, to the tolerance or with as many paths as --rays")
     bake.add_argument("--lamps-network", action="store_true", help="as --lamps, but what surfaces reflect is a "
-                      "network's (PyTorch), quicker and not to a tolerance")
+                      "network's (PyTorch) whatever its error; --lamps takes it where it keeps to the tolerance and is "
+                      "quicker")
     bake.add_argument("--texture", type=_side, metavar="SIDE",
                       help="bake to a texture of SIDE x SIDE texels instead; '50/m': so many texels a metre; 'fit': as "
                            "large as the tolerance needs (0.02 with --rays)")

@@ -16,7 +16,7 @@ from .backend.errors import UserError
 from .backend.transfer import Transfer
 from .cli_files import choose, save_file, set_number
 from .ops.batch import Batch, Outcome, finish_batch, prepare_batch
-from .properties import COLLECTION, DENSITY, FIT, NETWORK, PATHS, RAYS, RESOLUTION, TEXTURE, TOLERANCE, VERTICES
+from .properties import CHEAPEST, COLLECTION, DENSITY, FIT, NETWORK, RAYS, RESOLUTION, TEXTURE, TOLERANCE, VERTICES
 from .scene.read import make_applied_copy
 from .scene.render import render_preview
 from .scene.views import LIT
@@ -69,7 +69,7 @@ def prepare_bake(arguments: argparse.Namespace, objects: list[bpy.types.Object],
             raise UserError(f"There is no collection named '{arguments.occluders}' in the file.")
     set_number(settings, "bounces", arguments.bounces)
     settings.lamps = arguments.lamps or arguments.lamps_network
-    settings.lamps_by = NETWORK if arguments.lamps_network else PATHS
+    settings.lamps_by = NETWORK if arguments.lamps_network else CHEAPEST
     if arguments.texture is not None:
         settings.target = TEXTURE
         settings.sizing, size = arguments.texture

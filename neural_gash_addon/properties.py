@@ -30,7 +30,7 @@ from .scene.views import COEFFICIENT, LIT, OCCLUSION
 
 RAYS, TOLERANCE, COLLECTION = "RAYS", "TOLERANCE", "COLLECTION"
 VERTICES, TEXTURE = "VERTICES", "TEXTURE"
-PATHS, NETWORK = "PATHS", "NETWORK"
+CHEAPEST, PATHS, NETWORK = "CHEAPEST", "PATHS", "NETWORK"
 RESOLUTION, DENSITY, FIT = "RESOLUTION", "DENSITY", "FIT"
 
 
@@ -115,8 +115,10 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
         description="Bake the light of lamps and of materials that emit, too, with what all surfaces reflect of it in "
                     "their colours. It is of everything that is visible, as it stands; spot lamps are left out")
     lamps_by: EnumProperty(  # type: ignore[valid-type]
-        name="Lamps by", description="How the light of lamps is found", default=PATHS,
-        items=[(PATHS, "Path Tracing", "Paths from every point, as many as the tolerance asks for"),
+        name="Lamps by", description="How the light of lamps is found", default=CHEAPEST,
+        items=[(CHEAPEST, "Automatic", "The network where it keeps to the tolerance and paths would take much longer, "
+                "else paths"),
+               (PATHS, "Path Tracing", "Paths from every point, as many as the tolerance asks for"),
                (NETWORK, "Network (PyTorch)", "Direct light is traced; what surfaces reflect is traced at some "
                 "thousand points, and a network says from them what it is anywhere. For rooms of up to 20 m")])
     target: EnumProperty(  # type: ignore[valid-type]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What lamps add to a bake: irradiance at its points, to the same tolerance."""
+"""What lamps add to a bake: irradiance at its points, to the same tolerance, by paths or by the embedding's network."""
 from __future__ import annotations
 
 import math
@@ -10,8 +10,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import embedding_bake
+from .errors import UserError
 from .geometry import TriangleMesh
 from .irradiance import BATCHES, Irradiance, irradiance
 from .lit_scene import LitScene
@@ -23,6 +25,14 @@ from .transfer import Transfer
 _PILOT = 0.1    # of the progress
 _SAFELY = 1.05  # times the paths that the error asks for, which is an estimate
 FEWEST, MOST = 32, 4096  # paths from a point, to begin with and where the tolerance is not met before
+# What the network takes, in paths: for a room and for measuring its error, and at each point (docs/embedding.md).
+_ROOM, _POINT = 540_000, 80
+_WORTH = 2      # times what it takes have to be saved, as it may turn out to be no good
+_BEST = 0.04    # relative error below which it has been in no room
+_TRIAL = 512    # points at which it is tried
+
+
+Found = tuple[Irradiance, int, str]  # with its paths from each point, and a sentence of why
 
 
 @dataclass(eq=False)
@@ -34,7 +44,9 @@ class Lamps:
     notice: str = ""          # what of the lamps is not in it
     rays: int | None = None   # paths from every point, or
     tolerance: float | None = None  # relative L2 error to reach
-    learned: bool = False     # what surfaces reflect is the network's, of which direct light is traced; needs torch
+    # Whether what surfaces reflect is the network's, and direct light alone is traced; needs torch. None: where that
+    # keeps to the tolerance and is quicker.
+    learned: bool | None = False
     _room: Any = None         # embedding_bake.Room, once it has been encoded
 
     @cached_property
@@ -45,34 +57,64 @@ class Lamps:
             ) -> Generator[float, None, Transfer]:
         """The transfer of a mesh's points with the irradiance at them."""
         began = time.perf_counter()
-        found, rays = yield from (self._predicted if self.learned else self._traced)(mesh, seed, threads)
-        record = replace(transfer.record, lamps=self.key, lamps_rays=rays * len(mesh.points),
+        found, rays, why = yield from (self._predicted if self.learned else self._traced)(mesh, seed, threads)
+        record = replace(transfer.record.also(why), lamps=self.key, lamps_rays=rays * len(mesh.points),
                          lamps_error=relative(found),
                          lamps_notice=" ".join(filter(None, (found.notice, self.notice))),
                          basis=transfer.record.basis + LAMPS_BASIS,
                          seconds=transfer.record.seconds + time.perf_counter() - began)
         return replace(transfer, irradiance=found.values, record=record)
 
-    def _predicted(self, mesh: TriangleMesh, seed: int, threads: int | None
-                   ) -> Generator[float, None, tuple[Irradiance, int]]:
-        """Irradiance by the light-transport embedding, and the paths of its direct light. As good as it gets: the
-        error is measured, and not brought to a tolerance.
+    def _predicted(self, mesh: TriangleMesh, seed: int, threads: int | None) -> Generator[float, None, Found]:
+        """By the light-transport embedding; the paths are those of direct light. As good as it gets: the error is
+        measured, and not brought to a tolerance.
         """
-        start = 0.0
-        if self._room is None and len(self.scene.emitters):
-            start = 0.4
-            self._room = yield from scaled(embedding_bake.encoded(
-                self.scene, seed=seed, threads=threads, occluders=self._occluders), 0.0, start)
-        found = yield from scaled(embedding_bake.irradiance(
-            self.scene, mesh.points, mesh.normals, seed=seed, threads=threads, occluders=self._occluders,
-            clearance=mesh.clearance, room=self._room), start, 1 - start)
+        yield from scaled(self._encode(seed, threads), 0.0, 0.4)
+        found = yield from scaled(self._asked(mesh, np.arange(len(mesh.points)), seed, threads), 0.4, 0.6)
         if self.tolerance is not None and relative(found) > self.tolerance:
             found = replace(found, notice="The network's error is above the tolerance; by paths it would be met.")
-        return found, embedding_bake.STRAIGHT
+        return found, embedding_bake.STRAIGHT, ""
 
-    def _traced(self, mesh: TriangleMesh, seed: int, threads: int | None
-                ) -> Generator[float, None, tuple[Irradiance, int]]:
-        """Irradiance, and its paths from each point.
+    def _encode(self, seed: int, threads: int | None) -> Generator[float, None, None]:
+        """Make the room of the scene, if it is not there."""
+        if self._room is None and len(self.scene.emitters):
+            self._room = yield from embedding_bake.encoded(self.scene, seed=seed, threads=threads,
+                                                           occluders=self._occluders)
+
+    def _asked(self, mesh: TriangleMesh, rows: NDArray, seed: int, threads: int | None
+               ) -> Generator[float, None, Irradiance]:
+        """What the network says at some points."""
+        return (yield from embedding_bake.irradiance(
+            self.scene, mesh.points[rows], mesh.normals[rows], seed=seed, threads=threads, occluders=self._occluders,
+            clearance=mesh.clearance[rows], room=self._room))
+
+    def _learned(self, mesh: TriangleMesh, paths: float, seed: int, threads: int | None
+                 ) -> Generator[float, None, Found | None]:
+        """As `_predicted`, if that keeps to the tolerance at some points; `paths` from each are what it would save."""
+        assert self.tolerance is not None
+        facing = np.flatnonzero(mesh.normals.any(1))
+        rows = np.random.default_rng([seed, 12]).permutation(facing)[:_TRIAL]
+        try:
+            yield from scaled(self._encode(seed, threads), 0.0, 0.4)
+            tried = yield from scaled(self._asked(mesh, rows, seed, threads), 0.4, 0.1)
+        except UserError:  # no torch, or a larger room than it knows: paths need neither
+            return None
+        if relative(tried) > self.tolerance:
+            return None
+        found = yield from scaled(self._asked(mesh, np.arange(len(mesh.points)), seed, threads), 0.5, 0.5)
+        if relative(found) > self.tolerance:
+            return None
+        return found, embedding_bake.STRAIGHT, (f"Lamps by the network, which is {100 * relative(found):.2g} % off: "
+                                                f"quicker than {paths:.0f} paths a point.")
+
+    def _worth(self, paths: float, points: int) -> bool:
+        """Whether to try the network, if so many paths from each of so many points are still missing."""
+        assert self.tolerance is not None
+        cost = _ROOM * (self._room is None) + _POINT * points
+        return self.tolerance >= _BEST and paths * points > _WORTH * cost
+
+    def _traced(self, mesh: TriangleMesh, seed: int, threads: int | None) -> Generator[float, None, Found]:
+        """By paths.
 
         To a tolerance, as many paths again as there are, or the fewer that the error so far asks for, until it is met.
         """
@@ -91,10 +133,15 @@ class Lamps:
             if error <= tolerance or done >= MOST:
                 break
             missing = min(MOST, _SAFELY * done * (error / tolerance) ** 2) - done
+            if number == 0 and self.learned is None and self._worth(missing, len(mesh.points)):
+                learned = yield from scaled(self._learned(mesh, missing, seed, threads), start, 0.5 * (1 - start))
+                if learned is not None:
+                    return learned
+                start += 0.5 * (1 - start)
             rays = _whole_batches(min(done, missing))
             share = (1 - start) * min(1.0, rays / missing)
         assert found is not None
-        return found, done
+        return found, done, ""
 
 
 def relative(found: Irradiance) -> float:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import bpy
 
 from ..backend.lamps import Lamps
-from ..properties import NETWORK, NeuralGashSettings
+from ..properties import CHEAPEST, NETWORK, PATHS, NeuralGashSettings
 from ..scene.lamps import LitScenes
+
+
+_LEARNED = {CHEAPEST: None, PATHS: False, NETWORK: True}
 
 
 class LampReader:
@@ -14,7 +17,7 @@ class LampReader:
 
     def __init__(self, depsgraph: bpy.types.Depsgraph, settings: NeuralGashSettings) -> None:
         self._how = {**(settings.tracing() or {"tolerance": settings.tolerance}),
-                     "learned": settings.lamps_by == NETWORK}
+                     "learned": _LEARNED[settings.lamps_by]}
         self._scenes = LitScenes(depsgraph)
         self._known: dict[str, Lamps] = {}
 
