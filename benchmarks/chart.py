@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Error against time of every method, as data, pictures and tables: `python benchmarks/chart.py [--quick]`.
 
-What is in the folder's results.json already is not measured again; remove it to start afresh.
+What is in the folder's results.json already is not measured again; remove it to start afresh. A method that is new in
+the table is measured alone, beside the plain bake with 64 rays.
 """
 from __future__ import annotations
 
@@ -76,6 +77,7 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="small procedural meshes, few settings: a minute or two")
     parser.add_argument("--out", type=Path, help="folder for results.json and the pictures (out/chart)")
     parser.add_argument("--page", type=Path, help="page whose tables are replaced by this run's")
+    parser.add_argument("--again", choices=METHODS, help="measure this method anew, as it is another now")
     parser.add_argument("--draw", action="store_true", help="draw what is there, and measure nothing")
     arguments = parser.parse_args()
     folder = arguments.out or ROOT / "out" / "chart"
@@ -83,15 +85,16 @@ def main() -> int:
     path = folder / "results.json"
     cases = chart_measure.quick_cases() if arguments.quick else chart_measure.full_cases()
     blocks = chart_measure.load(path)
+    if arguments.again:
+        blocks = chart_measure.without(blocks, arguments.again)
     if not arguments.draw:
         lights = list(shipped_environments().values())
-        there = {block["key"] for block in blocks}
-        missing = [case for case in cases if case.key not in there]
+        missing = chart_measure.missing(cases, blocks)
         with tqdm(total=len(missing), unit="mesh", smoothing=0, mininterval=0.5,
                   bar_format="{desc}{percentage:.0f} %|{bar}| {elapsed}, {remaining} left") as bar:
-            for number, case in enumerate(missing):
+            for number, (case, names) in enumerate(missing):
                 bar.set_description(case.key)
-                blocks.append(methods.run(chart_measure.measure(case, lights),
+                blocks.append(methods.run(chart_measure.measure(case, lights, names),
                                           lambda share, number=number: bar.update(number + share - bar.n)))
                 chart_measure.save(path, blocks)
     if not blocks:

@@ -145,8 +145,27 @@ def _warm_peers(settings: Sequence[Setting]) -> None:
             methods.run(bake(next(setting for setting in settings if setting.method == name), 0))
 
 
-def measure(case: Case, lights: list[NDArray]) -> Generator[float, None, dict[str, Any]]:
-    """A block: where it was measured, and its rows in the order of COLUMNS."""
+def missing(cases: Iterable[Case], blocks: Iterable[dict[str, Any]]) -> list[tuple[Case, frozenset[str]]]:
+    """What is still to be measured of each case: methods of the table; all, if there is nothing of it."""
+    there = {(block["key"], row[COLUMNS.index("method")]) for block in blocks for row in block["rows"]}
+    found = [(case, frozenset(name for name in methods.METHODS if (case.key, name) not in there)) for case in cases]
+    return [(case, names) for case, names in found if names]
+
+
+def without(blocks: Iterable[dict[str, Any]], method: str) -> list[dict[str, Any]]:
+    """The blocks but for the rows of a method."""
+    kept = [{**block, "rows": [row for row in block["rows"] if row[COLUMNS.index("method")] != method]}
+            for block in blocks]
+    return [block for block in kept if block["rows"]]
+
+
+def measure(case: Case, lights: list[NDArray], only: frozenset[str] = frozenset(methods.METHODS)
+            ) -> Generator[float, None, dict[str, Any]]:
+    """A block: where it was measured, and its rows in the order of COLUMNS.
+
+    only: methods of the table. If that is not all, the others and the peers are there already; the plain bake is run
+    beside them for the ratio, and its rows are left out.
+    """
     mesh = _mesh(case.mesh)
     note = ""
     bake = compare.vertex_bake(mesh)
@@ -163,13 +182,17 @@ def measure(case: Case, lights: list[NDArray]) -> Generator[float, None, dict[st
                                             rays=setting.rays, seed=seed, threads=setting.threads)
             return np.concatenate(found.coefficients), found.record
     settings = _settings(case, len(points.points))
+    whole_table = only == frozenset(methods.METHODS)
+    if not whole_table:
+        settings = [setting for setting in settings if setting.method in only
+                    or setting == compare.baseline(setting.order, setting.threads)]
     memory: dict[str, dict[str, float] | str] = {}
     if case.sweep == "scale":  # first, so that what the machine has no room for is not tried here
-        for name in dict.fromkeys(setting.method for setting in settings):
+        for name in dict.fromkeys(setting.method for setting in settings if setting.method in only):
             rays = compare.BASELINE_RAYS if methods.METHODS[name].traces else None
             memory[name] = peak(name, int(case.mesh.split()[1]), ORDER, rays)
             yield 0.0
-        settings = [setting for setting in settings if not isinstance(memory[setting.method], str)]
+        settings = [setting for setting in settings if not isinstance(memory.get(setting.method), str)]
     sees = methods.METHODS["embree"].sees
     assert sees is not None
     scene = sees(points, ())
@@ -188,9 +211,10 @@ def measure(case: Case, lights: list[NDArray]) -> Generator[float, None, dict[st
         rounds = 1 if case.quick or len(mesh.points) > 500_000 else ROUNDS
         found = yield from scaled(compare.compare(whole, own, truth, lights, rounds, SEED),
                                    start + 0.3 * share, 0.7 * share)
-        out += [_row(case, len(points.points), m, note) for m in found]
-        out.append({"points": len(points.points), "method": "reference", "order": order,
-                    "rays": compare.REFERENCE_RAYS, **truth.floor(lights)})
+        out += [_row(case, len(points.points), m, note) for m in found if whole_table or m.setting.method in only]
+        if whole_table:
+            out.append({"points": len(points.points), "method": "reference", "order": order,
+                        "rays": compare.REFERENCE_RAYS, **truth.floor(lights)})
     for name, got in memory.items():
         if isinstance(got, str):
             out.append({"points": len(mesh.points), "method": name, "order": ORDER, "note": got})

@@ -52,3 +52,12 @@ def test_quick_form(tmp_path):
     before = (tmp_path / "results.json").read_bytes()
     assert run(tmp_path).strip()
     assert (tmp_path / "results.json").read_bytes() == before  # nothing was missing
+    rows = [row for block in results["blocks"] for row in block["rows"]]
+    assert run(tmp_path, "--again", "analytic").strip()  # as it is of a method that is new in the table
+    again = json.loads((tmp_path / "results.json").read_text())["blocks"]
+    method = results["columns"].index("method")
+    found = [row for block in again for row in block["rows"]]
+    assert sorted(row[:6] for row in found if row[method] == "analytic") \
+        == sorted(row[:6] for row in rows if row[method] == "analytic")
+    assert [row for row in found if row[method] != "analytic"] == [row for row in rows if row[method] != "analytic"]
+    assert len(again) == 2 * len(results["blocks"])
