@@ -205,7 +205,7 @@ def measure(case: Case, lights: list[NDArray], only: frozenset[str] = frozenset(
         truth = yield from scaled(compare.reference(points, order, rows, seed=REFERENCE_SEED, scene=scene),
                                    start, 0.3 * share)
         whole = bake
-        if case.sweep == "peers":
+        if case.sweep == "peers" and whole_table:
             whole = _with_peers(mesh, bake)
             _warm_peers(own)
         rounds = 1 if case.quick or len(mesh.points) > 500_000 else ROUNDS
