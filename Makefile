@@ -7,7 +7,7 @@
 # make chart  error against time of every method, in docs/chart (QUICK=1: a small one, in out/chart)
 # make planner  what the planner picks, beside the cheapest plan that meets the tolerance
 # make stability  where methods fail: a table, in docs/stability.md (QUICK=1: a small one, printed)
-# make train NETWORK=gnn   label meshes and train from nothing: gnn, hybrid, gnn-paper, mlp, end-to-end or student;
+# make train NETWORK=gnn   label meshes and train from nothing: gnn, hybrid, sky, gnn-paper, mlp, end-to-end or student;
 #   NETWORK=embedding labels rooms instead
 # make lint, package, bench, docs-pictures, clean: as they say
 .PHONY: chart data rooms train demo docs-pictures planner stability test test-window lint package bench clean system-packages
@@ -78,7 +78,7 @@ rooms: .venv/ready
 
 NETWORK ?= gnn
 train: $(if $(filter embedding,$(NETWORK)),rooms,data)
-	$(PY) -m training.$(if $(filter gnn hybrid embedding,$(NETWORK)),$(NETWORK),paper --network $(NETWORK))
+	$(PY) -m training.$(if $(filter gnn hybrid sky embedding,$(NETWORK)),$(NETWORK),paper --network $(NETWORK))
 
 clean:
 	rm -rf .venv .venv52 build dist out .pytest_cache .mypy_cache .ruff_cache

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from . import auto_bake, embree_bake, gnn_bake, hybrid_bake, paper_bake, sparse_bake
+from . import auto_bake, embree_bake, gnn_bake, hybrid_bake, paper_bake, sky_bake, sparse_bake
 from . import spherical_harmonics as sh
 from .bounce import BLACK, Reflection
 from .errors import UserError
@@ -79,6 +79,9 @@ METHODS: dict[str, Method] = {m.name: m for m in (
            "them; for dense meshes", traces=True, bake=sparse_bake.bake, sees=_embree_scene),
     Method("gnn", "Network", "A network reads the surface around each point, with no ray: soft shadows, quickly",
            traces=False, bake=gnn_bake.bake, sees=gnn_bake.voxels_of),
+    Method("embedding", "Embedding (PyTorch)", "Traces rays at some thousand points of the surface, and a network says "
+           "from them what blocks the light anywhere; what a point costs does not grow with the scene", traces=False,
+           bake=sky_bake.bake, sees=sky_bake.encoded),
     Method("gnn-paper", "Paper's network (PyTorch)", "The two-stage graph network of Neural-GASh, for comparison: "
            "shadows of what is near along the surface", traces=False, bake=paper_bake.bake_gnn),
     Method("gnn-paper-ao", "Paper's network with AO (PyTorch)", "The same, darkened where neighbours stand above the "

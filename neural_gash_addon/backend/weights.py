@@ -20,7 +20,7 @@ from .exchange import atomic
 from .hybrid import Layer, Network
 
 FOLDER = Path(__file__).parent / "networks"
-HYBRID, GNN, EMBEDDING = "hybrid.safetensors", "gnn.safetensors", "embedding.safetensors"
+HYBRID, GNN, EMBEDDING, SKY = (f"{name}.safetensors" for name in ("hybrid", "gnn", "embedding", "sky"))
 CHECKSUMS = "checksums.json"  # file name -> SHA-256, beside the weights
 
 

@@ -8,7 +8,6 @@ from ..backend.lamps import Lamps
 from ..properties import CHEAPEST, NETWORK, PATHS, NeuralGashSettings
 from ..scene.lamps import LitScenes
 
-
 _LEARNED = {CHEAPEST: None, PATHS: False, NETWORK: True}
 
 

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The bake by the light-transport embedding (`embedding`): scene points are traced, all else is asked. Needs torch.
+
+Transfer has no size, so, unlike light in rooms, no scale is fixed: scenes are brought to one.
+"""
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import embedding, sampling, weights
+from . import spherical_harmonics as sh
+from .estimator import BlockedEstimator, morton_order
+from .geometry import TEXEL, TriangleMesh
+from .hybrid import FULL
+from .nearest import nearest_to
+from .paper_bake import import_torch
+from .progress import run, scaled
+from .raycast import Geometry, Occluders
+from .record import BakeRecord
+from .scene_points import CANDIDATES, TURN, farthest
+from .transfer import Transfer
+from .workers import default_threads
+
+POINTS, RAYS = 4096, 64        # scene points, and rays from each: noisy at one, and not over a neighbourhood
+CHECKED, CHECKS = 128, 64      # points that are traced twice to know the error; rays of each
+QUERIES_AT_ONCE = 4096         # decoded together, so that memory does not grow with their number
+_ENCODING = 0.3                # of the progress
+_LOGGER = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePoints:
+    """M points of a surface in farthest-point order, and what blocks the sky there."""
+
+    places: NDArray[np.float32]   # (M, 3), the scene's longest side embedding.EXTENT
+    normals: NDArray[np.float32]  # (M, 3) unit, of faces
+    blocked: NDArray[np.float32]  # (M, K), traced: see `split`
+    rays: int                     # from each
+
+
+def split(blocked: NDArray, normals: NDArray) -> NDArray[np.float32]:
+    """A blocked part (N, K) as the share of the sky that is blocked, and how it differs from an even sky of it."""
+    return _with_even(blocked, normals, -1.0)
+
+
+def joined(found: NDArray, normals: NDArray) -> NDArray[np.float32]:
+    """The inverse of `split`."""
+    return _with_even(found, normals, 1.0)
+
+
+def _with_even(values: NDArray, normals: NDArray, sign: float) -> NDArray[np.float32]:
+    out = np.array(values, np.float32)
+    even = sh.cosine_lobe(normals, sh.order_of(out.shape[1]))[:, 1:] / FULL
+    out[:, 1:] += sign * out[:, :1] * even
+    return out
+
+
+def on_surface(mesh: TriangleMesh, count: int, seed: int) -> TriangleMesh:
+    """Points of a mesh by area, `count` in farthest-point order, each of its face; none where it has no area."""
+    corners = mesh.positions[mesh.triangles]
+    double = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    sizes = np.linalg.norm(double, axis=1)
+    places = normals = np.zeros((0, 3))
+    if sizes.sum() > 0:
+        rng = np.random.default_rng([seed, 14])
+        bits = sampling.owen_scramble(sampling.sobol2(CANDIDATES * count), rng.integers(0, 2**32, 2, dtype=np.uint32))
+        faces, u, v = sampling.on_triangles(np.cumsum(sizes), (bits.T + rng.random((2, len(bits)))) / 2.0 ** 32)
+        here = corners[faces]
+        candidates = here[:, 0] + u[:, None] * (here[:, 1] - here[:, 0]) + v[:, None] * (here[:, 2] - here[:, 0])
+        facing = double[faces] / sizes[faces, None]
+        spacing = float(np.sqrt(sizes.sum() / 2 / count))
+        kept = farthest(np.concatenate([candidates, TURN * spacing * facing], 1), count)
+        places, normals = candidates[kept], facing[kept]
+    return TriangleMesh(mesh.positions, mesh.triangles, places, normals, normals,
+                        np.arange(len(places), dtype=np.int32), TEXEL, mesh.resolution)
+
+
+def traced(points: TriangleMesh, occluders: Occluders, order: int, rays: int, seed: int, threads: int
+           ) -> Generator[float, None, NDArray[np.float64]]:
+    """Blocked part (N, K) at points, in the axes of the bake. Yields progress."""
+    if not len(points.points):
+        return np.zeros((0, order * order))
+    rows = morton_order(points.points)
+    estimator = BlockedEstimator(points, occluders, order, seed, rays)
+    sums, out = np.zeros((len(rows), order * order)), np.zeros((len(rows), order * order))
+    with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+        yield from estimator.trace(pool, threads, rows, 0, rays, sums)
+        out[rows] = estimator.turned(pool, rows, estimator.means(rows, sums, 0, rays))
+    return out
+
+
+def scene_points(mesh: TriangleMesh, occluders: Occluders, count: int = POINTS, rays: int = RAYS, *, seed: int = 0,
+                 threads: int | None = None, order: int = sh.MAX_ORDER) -> Generator[float, None, ScenePoints]:
+    """What the network reads of a mesh; what else blocks its light is in what its points see. Yields progress."""
+    points = on_surface(mesh, count, seed)
+    blocked = yield from traced(points, occluders, order, rays, seed, threads or default_threads())
+    return ScenePoints(in_scale(points.points, occluders), points.normals.astype(np.float32),
+                       split(blocked, points.normals), rays)
+
+
+def in_scale(places: NDArray, occluders: Occluders) -> NDArray[np.float32]:
+    """Places (N, 3) as the network knows them."""
+    return np.float32(embedding.EXTENT) * occluders.normalise(places)
+
+
+def network() -> Any:
+    """The trained network: networks.sky.SkyEmbedding, in `eval` mode. Raises UserError: no torch or weights."""
+    torch = import_torch("embedding")
+    from .networks.embedding import SMALL
+    from .networks.sky import SkyEmbedding
+
+    model = SkyEmbedding(SMALL)
+    arrays = weights.load(weights.FOLDER / weights.SKY)
+    model.load_state_dict({key: torch.from_numpy(array.copy()) for key, array in arrays.items()})
+    return model.eval()
+
+
+class Sky:
+    """A scene's codes, which answer for any point."""
+
+    def __init__(self, model: Any, occluders: Occluders, points: ScenePoints, device: str = "cpu") -> None:
+        """Encode at least one point. model: networks.sky.SkyEmbedding in `eval` mode, moved to the device."""
+        import torch
+
+        from .networks.embedding import Frame
+
+        self.occluders, self.rays = occluders, points.rays * len(points.places)
+        self._model, self._device = model.to(device), device
+        sizes = model.settings
+        layout = embedding.layout(points.places, sizes.gathered, sizes.around)
+        self._places = points.places
+        parents = nearest_to(points.places, points.places[:len(layout.around)], 1)[:, 0]
+        self._frame = Frame.of(self._tensor(points.places), self._tensor(points.normals), layout)
+        with torch.no_grad():
+            self._codes = model.encoder(self._frame, self._tensor(points.blocked),
+                                        torch.from_numpy(parents).to(device))
+
+    def blocked(self, points: NDArray, normals: NDArray, order: int) -> NDArray[np.float32]:
+        """Blocked part (n, K) at points (n, 3) with unit normals."""
+        import torch
+
+        from .networks.sky import Codes
+
+        places, terms = in_scale(points, self.occluders), order * order
+        near = torch.from_numpy(nearest_to(places, self._places, self._model.settings.neighbours)).to(self._device)
+        codes = Codes(self._codes.values[:, :terms], self._codes.key, self._codes.value)
+        with torch.no_grad():
+            found = self._model.decoder(codes, self._frame, self._tensor(places), self._tensor(normals), near)
+        found = found.cpu().numpy()
+        found[:, 0] = np.clip(found[:, 0], 0, FULL)
+        return joined(found, normals)
+
+    def _tensor(self, array: NDArray) -> Any:
+        import torch
+
+        return torch.from_numpy(np.ascontiguousarray(array, np.float32)).to(self._device)
+
+
+def encoded(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> Sky | None:
+    """What the method sees of a mesh and of what else blocks its light; None where it has no area.
+
+    Raises:
+        UserError: no torch, or weights that are not those that were shipped.
+    """
+    import_torch("embedding")
+    scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
+    return run(_encode(scene, mesh, 0, default_threads()))
+
+
+def _encode(scene: Occluders, mesh: TriangleMesh, seed: int, threads: int) -> Generator[float, None, Sky | None]:
+    model = network()
+    points = yield from scene_points(mesh, scene, seed=seed, threads=threads)
+    if not len(points.places):
+        return None
+    torch = import_torch("embedding")
+    if torch.cuda.is_available():
+        try:
+            return Sky(model, scene, points, "cuda")
+        except torch.cuda.OutOfMemoryError:
+            _LOGGER.warning("The GPU has too little memory for this mesh; its processor does the work.")
+            torch.cuda.empty_cache()
+    return Sky(model, scene, points)
+
+
+def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None, occluders: Sequence[Geometry],
+         seed: int, threads: int | None, scene: Sky | None = None) -> Generator[float, None, Transfer]:
+    """Ask the embedding at every point; arguments as `methods.bake`. Rays and tolerance do not matter.
+
+    Raises:
+        UserError: no torch, or weights that are not those that were shipped.
+    """
+    began = time.perf_counter()
+    torch = import_torch("embedding")
+    threads = threads or default_threads()
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        sky, used = scene, 0  # whose rays count once, where several bakes share it
+        if sky is None:
+            built = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
+            sky = yield from scaled(_encode(built, mesh, seed, threads), 0.0, _ENCODING)
+            used = sky.rays if sky is not None else 0
+        coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
+        lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+        lit = lit[morton_order(mesh.points[lit])] if len(lit) else lit
+        for start in range(0, len(lit), QUERIES_AT_ONCE):
+            rows = lit[start:start + QUERIES_AT_ONCE]
+            coefficients[rows] = sh.cosine_lobe(mesh.normals[rows], order)
+            if sky is not None:
+                coefficients[rows] -= sky.blocked(mesh.points[rows], mesh.normals[rows], order)
+            yield _ENCODING + (1 - _ENCODING) * (start + len(rows)) / len(lit)
+        error, checked = None, np.random.default_rng([seed, 15]).permutation(lit)[:CHECKED]
+        if sky is not None:
+            error = yield from scaled(_error(mesh, sky.occluders, checked, coefficients, seed, threads), 1, 0)
+    finally:
+        torch.set_num_threads(before)
+    return Transfer(coefficients, BakeRecord(
+        method="embedding", order=order, points=len(mesh.points), domain=mesh.domain, rays=used,
+        probe_rays=2 * CHECKS * len(checked) if sky is not None else 0, seed=seed, seconds=time.perf_counter() - began,
+        error_estimate=error))
+
+
+def _error(mesh: TriangleMesh, occluders: Occluders, rows: NDArray, coefficients: NDArray, seed: int, threads: int
+           ) -> Generator[float, None, float | None]:
+    """Relative L2 error at some points, by two independent traces, whose noise cancels in the product."""
+    order, few = sh.order_of(coefficients.shape[1]), replace(
+        mesh, points=mesh.points[rows], normals=mesh.normals[rows], clearance=mesh.clearance[rows])
+    truth = []
+    for number in range(2):
+        own = int(np.random.SeedSequence([seed, 16, number]).generate_state(1)[0])
+        blocked = yield from scaled(traced(few, occluders, order, CHECKS, own, threads), number / 2, 1 / 2)
+        truth.append(sh.cosine_lobe(few.normals, order) - blocked)
+    squared = float(((coefficients[rows] - truth[0]) * (coefficients[rows] - truth[1])).sum())
+    energy = float((truth[0] * truth[1]).sum())
+    return float(max(squared, 0.0) / energy) ** 0.5 if energy > 0 else None
