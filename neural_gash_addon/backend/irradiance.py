@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import sampling
-from . import spherical_harmonics as sh
 from .bounce import spread
 from .errors import UserError
 from .geometry import NOT_FINITE
@@ -44,14 +43,11 @@ class Irradiance:
     values: Floats    # (N, 3) W/m^2
     error: Floats     # (N, 3) standard error of each
     notice: str = ""  # what a person should know, if there is anything
-    # (N, K, 3), where asked for: int L(w) max(n.w, 0) Y_k(w) dw of the incident radiance, W/m^2. The irradiance is the
-    # first over Y_0; a glossy lobe damps the bands (docs/glossy, `gloss`).
-    harmonics: Floats | None = None
 
 
 def irradiance(scene: LitScene, points: NDArray, normals: NDArray, rays: int = RAYS, *, depth: int = DEPTH,
                straight: bool = True, seed: int = 0, threads: int | None = None, occluders: Occluders | None = None,
-               clearance: NDArray | None = None, order: int = 0) -> Generator[float, None, Irradiance]:
+               clearance: NDArray | None = None) -> Generator[float, None, Irradiance]:
     """Light that arrives at points from all emitters, direct and reflected up to depth - 1 times.
 
     Args:
@@ -60,7 +56,6 @@ def irradiance(scene: LitScene, points: NDArray, normals: NDArray, rays: int = R
         straight: whether what comes straight from emitters counts, or only what was reflected.
         occluders: `scene.occluders()`, if it is there already.
         clearance: (N, 3) from points to where their rays start (see TriangleMesh); along the normals where not given.
-        order: bands of `harmonics`, world axes; 0: none.
     Yields:
         Progress, 0 to 1. Closing the generator stops the workers.
     Raises:
@@ -73,10 +68,9 @@ def irradiance(scene: LitScene, points: NDArray, normals: NDArray, rays: int = R
     if not (np.isfinite(points).all() and np.isfinite(normals).all()):
         raise UserError(NOT_FINITE)
     values, error = np.zeros((2, len(points), 3), np.float32)
-    harmonics = np.zeros((len(points), order * order, 3), np.float32) if order else None
     if not len(scene.emitters):
-        return Irradiance(values, error, DARK, harmonics)
-    tracer = _Tracer(scene, occluders or scene.occluders(), -(-rays // BATCHES), depth, straight, seed, order)
+        return Irradiance(values, error, DARK)
+    tracer = _Tracer(scene, occluders or scene.occluders(), -(-rays // BATCHES), depth, straight, seed)
     lit = np.flatnonzero(np.any(normals != 0, axis=1))
     step = max(1, _PATHS_AT_ONCE // (BATCHES * tracer.paths))
     jobs = [lit[start:start + step] for start in range(0, len(lit), step)]
@@ -84,23 +78,22 @@ def irradiance(scene: LitScene, points: NDArray, normals: NDArray, rays: int = R
 
     def part(job: tuple[NDArray, np.random.SeedSequence]) -> None:
         rows, own = job
-        batches, lobes = tracer.trace(points[rows], normals[rows], clearance[rows], np.random.default_rng(own))
+        # (n, BATCHES, 3)
+        batches = tracer.trace(points[rows], normals[rows], clearance[rows], np.random.default_rng(own))
         values[rows] = batches.mean(1)
         error[rows] = batches.std(1, ddof=1) / BATCHES ** 0.5
-        if harmonics is not None:
-            harmonics[rows] = lobes
 
     yield from spread(part, list(zip(jobs, seeds, strict=True)), threads or default_threads())
-    return Irradiance(values, error, harmonics=harmonics)
+    return Irradiance(values, error)
 
 
 class _Tracer:
     """The scene as tables of float32 that waves of paths look up."""
 
-    def __init__(self, scene: LitScene, occluders: Occluders, paths: int, depth: int, straight: bool, seed: int,
-                 order: int) -> None:
+    def __init__(self, scene: LitScene, occluders: Occluders, paths: int, depth: int, straight: bool, seed: int
+                 ) -> None:
         """paths: of a batch, from each point."""
-        self.paths, self._depth, self._straight, self._order = paths, depth, straight, order
+        self.paths, self._depth, self._straight = paths, depth, straight
         self._scene, self._occluders = scene, occluders
         self._offset = np.float32(occluders.offset)
         corners = ((scene.corners - occluders.centre) * occluders.scale).transpose(1, 2, 0)  # (corner, axis, F)
@@ -125,12 +118,11 @@ class _Tracer:
         self._nets = ((nets.transpose(2, 0, 1) + 0.5) / 2.0 ** 32).astype(np.float32)        # (2, sets, paths)
 
     def trace(self, points: NDArray, normals: NDArray, clearance: NDArray, rng: np.random.Generator
-              ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Irradiance at points (n, 3) by each batch of paths, (n, BATCHES, 3); and harmonics (n, K, 3) by all."""
+              ) -> NDArray[np.float64]:
+        """Irradiance at points (n, 3) by each batch of paths: (n, BATCHES, 3)."""
         each = BATCHES * self.paths
         count = len(points) * each
-        gathered = np.zeros((3, count), np.float32)  # by each path, over pi: what comes along its first ray
-        chosen = np.zeros((3, count), np.float32)    # and from the emitters that are chosen at its first vertex
+        gathered = np.zeros((3, count), np.float32)  # by each path, over pi
         origins = self._occluders.origins(points, clearance).T.repeat(each, axis=1)
         frames = sampling.frames(normals, np.zeros(len(normals))).astype(np.float32)
         tangents, bitangents, up = (frames[:, :, k].T.repeat(each, axis=1) for k in range(3))
@@ -144,15 +136,11 @@ class _Tracer:
                                else rng.random((2, 2, n), np.float32))
             counts = vertex > 0 or self._straight
             if counts:
-                ways = self._gather_emitters(gathered if vertex else chosen, path, carried, origins, up, towards)
-                if vertex == 0:
-                    there = ways
+                self._gather_emitters(gathered, path, carried, origins, up, towards)
             radius, angle = np.sqrt(around[0]), around[1] * np.float32(2 * np.pi)
             cosine = np.sqrt(1 - around[0])
             directions = tangents * (radius * np.cos(angle)) + bitangents * (radius * np.sin(angle)) + up * cosine
             faces, u, v, _ = self._occluders.first(_rows(origins), _rows(directions))
-            if vertex == 0:
-                along = directions
             if counts:
                 self._gather_met(gathered, path, carried, origins, directions, cosine, faces, u, v)
             if vertex == self._depth - 1:
@@ -167,13 +155,8 @@ class _Tracer:
             tangents, bitangents, up = found[9:12], found[12:15], found[15:18]
             up = up * -np.sign(_dot(up, directions))  # of the side that was met
             origins = found[:3] + u * found[3:6] + v * found[6:9] + self._offset * up
-        sums = (gathered + chosen).reshape(3, len(points), BATCHES, self.paths).sum(3, dtype=np.float64)
-        lobes = np.zeros((len(points), self._order ** 2, 3))
-        for light, directions in ((gathered, along), *([(chosen, there)] if self._straight else [])):
-            if self._order:
-                values = sh.evaluate(_rows(directions), self._order).reshape(len(points), each, -1)
-                lobes += values.transpose(0, 2, 1) @ light.T.reshape(len(points), each, 3).astype(np.float64)
-        return np.pi / self.paths * sums.transpose(1, 2, 0), np.pi / each * lobes
+        sums = gathered.reshape(3, len(points), BATCHES, self.paths).sum(3, dtype=np.float64)
+        return np.pi / self.paths * sums.transpose(1, 2, 0)
 
     def _net(self, rng: np.random.Generator, batches: int) -> Floats:
         """(2, batches * paths): of each batch one of the nets, shifted at random."""
@@ -182,18 +165,13 @@ class _Tracer:
         return np.minimum(shifted - np.floor(shifted), _BELOW_ONE).reshape(2, -1)
 
     def _gather_emitters(self, gathered: Floats, path: NDArray, carried: Floats, origins: Floats, up: Floats,
-                         pairs: Floats) -> Floats:
-        """Add what comes from a point on an emitter, chosen by pairs (2, n), unless something is between.
-
-        Returns:
-            (3, n) unit vectors towards them.
-        """
+                         pairs: Floats) -> None:
+        """Add what comes from a point on an emitter, chosen by pairs (2, n), unless something is between."""
         chosen, u, v = sampling.on_triangles(self._cumulative, pairs)
         faces = self._emitters[chosen]
         found = self._faces.take(faces, 0).T
         there = found[15:18]
         ways = found[:3] + u * found[3:6] + v * found[6:9] - origins
-        towards = ways / np.sqrt(np.maximum(_dot(ways, ways), 1e-30))
         above, facing = _dot(ways, up), -_dot(ways, there)
         good = np.flatnonzero((above > 0) & ((facing > 0) | self._behind[faces] & (facing < 0)))
         faces, facing, ways = faces[good], facing[good], ways.take(good, 1)
@@ -203,7 +181,6 @@ class _Tracer:
         good, faces = good[free], faces[free]
         form = above[good] * np.abs(facing[free]) / (np.float32(np.pi) * square[free] ** 2)
         self._add(gathered, path, carried, good, faces, form / (self._density[faces] + self._meeting[faces] * form))
-        return towards
 
     def _gather_met(self, gathered: Floats, path: NDArray, carried: Floats, origins: Floats, directions: Floats,
                     cosine: Floats, faces: NDArray, u: Floats, v: Floats) -> None:
