@@ -109,7 +109,7 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
         before = fingerprint(obj, depsgraph, mode, texture.part.uv, reflection is not None)
         key = _key(settings, before, read.matrix, maps, lit)
         bake = partial(bake_texture, read.surface, **what, **quality, folder=tiles, reflection=reflection, key=key,
-                       lamps=lit)
+                       lamps=lit, whole=settings.gloss)  # metals show the high bands, which dull surfaces do not
     else:
         before = fingerprint(obj, depsgraph, mode, bounces=reflection is not None)
         key = _key(settings, before, read.matrix, (), lit)
