@@ -27,6 +27,7 @@ _LEAST_RAYS, _MOST_RAYS = 16, 128
 _SETS = 4
 _UNEVEN = 1.1                 # of the noise of rays that are no power of two, and so no whole net, to that of such
 _BESIDES = 4.0                # what a point costs besides its rays, in rays
+_DARK = 1e-3                  # of the transfer in the open: less than this is as good as none
 _SURE = 1.3                   # standard errors of a share that are added to it, to be above it in nine cases of ten
 
 
@@ -52,8 +53,10 @@ class Pilot:
                      self.traced)
 
     def beyond(self, order: int) -> tuple[float, float]:
-        """What the bands from `order` on are of |T|, and a bound that is met in nine cases of ten."""
+        """What the bands from `order` on are of |T|, and a bound as of `most_blocked`; infinite in the dark."""
         lights, _ = self._energies()
+        if float(lights.sum()) <= _DARK ** 2 * float(np.square(self.unshadowed).sum()):
+            return np.inf, np.inf
         return _part(lights[:, sh.coefficient_count(order):].sum(1), lights.sum(1))
 
     def without_shadows(self, order: int) -> tuple[float, float]:
