@@ -11,16 +11,17 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 from . import advice
-from .bands import Bands, all_of, of_open_sky, of_shadowed
+from .bands import Bands, all_of, of_open_sky
 from .geometry import TriangleMesh
 from .pilot import Pilot, look
-from .plan import Plan, choose, choose_bands, nothing_blocks
+from .plan import Plan, choose, choose_bands, nothing_blocks, traced_bands
 from .progress import scaled
 from .raycast import Geometry, Occluders
 from .transfer import Transfer
 from .workers import default_threads
 
 _PILOT_SHARE = 0.05  # of the progress
+_MANY = 1 << 18  # points that are baked at a time, where those that are looked at are but some of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,4 +97,5 @@ def enough_bands(mesh: TriangleMesh, order: int, tolerance: float, occluders: Se
         return of_open_sky(order, tolerance)
     threads = threads or default_threads()
     with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
-        return of_shadowed((yield from look(mesh, scene, order, tolerance, seed, pool, threads)), order, tolerance)
+        pilot = yield from look(mesh, scene, order, tolerance, seed, pool, threads)
+    return traced_bands(pilot, _MANY, order, tolerance)[1]

@@ -16,10 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from . import spherical_harmonics as sh
-from .pilot import Pilot
 
 LEAST_ORDER = 2
-_OPEN = 0.95  # of a tolerance: what may be dropped where all else is exact
+MOST_DROPPED = 0.95  # of a tolerance
 
 
 @dataclass(frozen=True)
@@ -49,19 +48,8 @@ def of_open_sky(order: int, tolerance: float) -> Bands:
     bands = np.arange(order)
     energy = np.square(sh.cosine_lobe_bands(order)) * (2 * bands + 1)
     parts = [float(energy[fewer:].sum() / energy.sum()) ** 0.5 for fewer in range(order)]
-    fewest = next((n for n in range(LEAST_ORDER, order) if parts[n] <= _OPEN * tolerance), order)
+    fewest = next((n for n in range(LEAST_ORDER, order) if parts[n] <= MOST_DROPPED * tolerance), order)
     return chosen(fewest, order, tolerance, [(part, part) for part in parts])
-
-
-def of_shadowed(found: Pilot, order: int, tolerance: float) -> Bands:
-    """The fewest bands that are enough where the others are traced, and want no more rays for it.
-
-    Noise is about alike in all coefficients, so n of m bands have n / m of it: so much of the tolerance must be left.
-    """
-    parts = [found.beyond(fewer) for fewer in range(order)]
-    fewest = next((n for n in range(LEAST_ORDER, order)
-                   if parts[n][1] <= (1 - (n / order) ** 2) ** 0.5 * tolerance), order)
-    return chosen(fewest, order, tolerance, parts)
 
 
 def chosen(order: int, asked: int, tolerance: float, parts: Sequence[tuple[float, float]]) -> Bands:

@@ -72,7 +72,8 @@ METHODS: dict[str, Method] = {m.name: m for m in (
            traces=False, bake=_analytic),
     Method("embree", "Ray traced", "Traces rays with Embree to find what blocks the light; the reference",
            traces=True, bake=embree_bake.bake, sees=_embree_scene),
-    Method("auto", "Automatic", "Looks at a few points, and takes the cheapest method that meets the tolerance",
+    Method("auto", "Automatic", "Looks at a few points, and takes the cheapest method, and the fewest bands, that meet "
+           "the tolerance",
            traces=True, bake=_auto, sees=_embree_scene, plans=True),
     Method("hybrid", "Few rays and network", "Traces few rays, and a small network takes the rest from neighbours: "
            "smooth at once, and exact with many rays", traces=True, bake=hybrid_bake.bake, sees=_embree_scene),

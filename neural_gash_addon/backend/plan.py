@@ -94,10 +94,28 @@ def choose_bands(found: Pilot, points: int, order: int, tolerance: float) -> tup
     """
     for fewer in range(bands.LEAST_ORDER, order + 1):
         if found.without_shadows(fewer)[1] <= tolerance:
-            parts = [found.beyond(n) for n in range(order)]
-            return _unshadowed(found.to_order(fewer)), bands.chosen(fewer, order, tolerance, parts)
-    enough = bands.of_shadowed(found, order, tolerance)
-    return choose(found.to_order(enough.order), points, enough.left, tolerance), enough
+            return _unshadowed(found.to_order(fewer)), bands.chosen(fewer, order, tolerance, _parts(found, order))
+    return traced_bands(found, points, order, tolerance)
+
+
+def traced_bands(found: Pilot, points: int, order: int, tolerance: float) -> tuple[Plan, Bands]:
+    """As `choose_bands`, where shadows are not looked at as a whole: the fewest bands that take no more time than all.
+
+    Noise goes with the bands, so that the others mostly need fewer rays, though less of the tolerance is left for them.
+    """
+    parts = _parts(found, order)
+    every = choose(found, points, tolerance)
+    for fewer in range(bands.LEAST_ORDER, order):
+        if parts[fewer][1] <= bands.MOST_DROPPED * tolerance:
+            enough, cut = bands.chosen(fewer, order, tolerance, parts), found.to_order(fewer)
+            plan = choose(cut, points, enough.left, tolerance)
+            if seconds(plan, cut, points) <= seconds(every, found, points):
+                return plan, enough
+    return every, bands.chosen(order, order, tolerance, parts)
+
+
+def _parts(found: Pilot, order: int) -> list[tuple[float, float]]:
+    return [found.beyond(fewer) for fewer in range(order)]
 
 
 def choose(found: Pilot, points: int, tolerance: float, asked: float | None = None) -> Plan:
@@ -132,6 +150,8 @@ def plans(found: Pilot, points: int, tolerance: float, asked: float | None = Non
 
 def seconds(plan: Plan, found: Pilot, points: int) -> float:
     """What a plan is expected to take, the scene aside, which all have alike."""
+    if plan.method == "analytic":
+        return 0.0
     assert plan.rays is not None or plan.tolerance is not None
     if plan.method == "embree":
         rays = plan.rays or max(found.needed_rays(plan.tolerance or 1.0), 2.0 * FIRST_RAYS)

@@ -168,7 +168,7 @@ def _key(settings: NeuralGashSettings, shape: str, matrix: NDArray, maps: Sequen
                       + f"{normal_map.strength} {normal_map.extension}".encode())
     chosen = {name: getattr(settings, name) for name in
               ("method", "order", "quality", "rays", "tolerance", "sizing", "side", "texels_per_metre", "padding",
-               "bounces", "share")}
+               "bounces", "share", "gloss")}
     return json.dumps({"version": VERSION, "shape": shape, "place": digest.hexdigest(),
                        "lamps": "" if lamps is None else f"{lamps.key} {lamps.learned}", **chosen}, sort_keys=True)
 
