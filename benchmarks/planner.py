@@ -8,13 +8,16 @@ the points) is no more. The error is the product of the differences from two ref
 their own: so their noise, which a single one would add to what is measured, cancels. The planner's own time has
 everything in it: its pilot, its looks for what blocks and inside faces. A pilot may cost 50 ms or a tenth of the plan:
 the second regret leaves out so much of these.
+
+With --bands: the planner beside itself when it is held to bake all bands of --order, instead of the candidates; errors
+are those over all these bands.
 """
 from __future__ import annotations
 
 import argparse
 import sys
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -26,11 +29,12 @@ from meshes import FOLDER, read
 from numpy.typing import NDArray
 
 from neural_gash_addon.backend import auto_bake, methods, sparse_bake
+from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.geometry import TriangleMesh
 from neural_gash_addon.backend.transfer import Transfer
 
 TOLERANCES = (0.2, 0.1, 0.05, 0.02, 0.01)
-ORDER, REFERENCE_RAYS, POINTS = 3, 2048, 2000
+REFERENCE_RAYS, POINTS = 2048, 2000
 FIXED: list[tuple[str, dict]] = [("analytic", {}), *(("embree", {"rays": rays}) for rays in (4, 8, 16, 32))]
 MEASURING = ("embree", "hybrid", "sparse")
 FEW_POINTS = 4 * sparse_bake.FEWEST  # with less, a sparse bake is a ray-traced one
@@ -39,8 +43,9 @@ FREE_SECONDS, FREE_SHARE = 0.05, 0.1  # that a pilot may cost, whichever is more
 
 
 def relative(found: NDArray, truth: Sequence[NDArray]) -> float:
-    """Relative L2 error (n, K) against two references (n, K) whose noise is independent."""
+    """Relative L2 error (n, k) against two references (n, K) whose noise is independent; bands that lack are zero."""
     one, two = truth
+    found = sh.padded(found, one.shape[1])
     squared = float(((found - one) * (found - two)).sum())
     return (max(squared, 0.0) / float((one * two).sum())) ** 0.5
 
@@ -48,10 +53,11 @@ def relative(found: NDArray, truth: Sequence[NDArray]) -> float:
 def timed(mesh: TriangleMesh, rows: NDArray, truth: Sequence[NDArray], method: str, repeats: int, **wish: float
           ) -> tuple[float, float, Transfer]:
     """Processor seconds (the least of some runs), true error and outcome of a bake."""
+    order = sh.order_of(truth[0].shape[1])
     times: list[float] = []
     while _again(times, repeats):
         began = time.process_time()
-        found = methods.run(methods.bake(mesh, method, ORDER, threads=1, **wish))
+        found = methods.run(methods.bake(mesh, method, order, threads=1, **wish))
         times.append(time.process_time() - began)
     return min(times), relative(found.coefficients[rows], truth), found
 
@@ -60,13 +66,14 @@ def looked(mesh: TriangleMesh, rows: NDArray, truth: Sequence[NDArray], repeats:
            ) -> tuple[float, float, float, Transfer]:
     """As `timed`, of the planner; second: what its looks take (and the scene, if the plan wants none)."""
     runs: list[tuple[float, float]] = []
+    order = sh.order_of(truth[0].shape[1])
     while _again([spent for spent, _ in runs], repeats):
         looks, scenes = [0.0], [0.0]
         with patch.object(auto_bake, "planned", _clocked(auto_bake.planned, looks)), \
                 patch.object(auto_bake.advice, "inside_faces", _clocked(auto_bake.advice.inside_faces, looks)), \
                 patch.object(auto_bake, "Occluders", _clocked_at_once(auto_bake.Occluders, scenes)):
             began = time.process_time()
-            found = methods.run(methods.bake(mesh, "auto", ORDER, threads=1, tolerance=tolerance))
+            found = methods.run(methods.bake(mesh, "auto", order, threads=1, tolerance=tolerance))
             spent = time.process_time() - began
         runs.append((spent, sum(looks) - (sum(scenes) if found.record.method != "analytic" else 0)))
     spent, pilot = min(runs)
@@ -98,38 +105,40 @@ def _clocked_at_once(work: Callable, times: list[float]) -> Callable:
     return clocked
 
 
-def main() -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--folder", type=Path, default=FOLDER / "validation")
-    parser.add_argument("--only", nargs="*", default=[""], help="files whose name has one of these in it")
-    parser.add_argument("--repeats", type=int, default=3)
-    arguments = parser.parse_args()
-    print(f"Order {ORDER}, one thread, processor seconds.\n\n| mesh | vertices | tolerance | plan | s | error | "
-          "pilot s | cheapest | s | regret | less the pilot |\n|---|---|---|---|---|---|---|---|---|---|---|",
-          flush=True)
-    regrets: dict[float, list[tuple[float, float]]] = {tolerance: [] for tolerance in TOLERANCES}
-    misses: list[float] = []
+def meshes(arguments: argparse.Namespace) -> Iterator[tuple[str, TriangleMesh, NDArray, list[NDArray]]]:
+    """Name, mesh, points at which errors are measured (n,), and two references (n, K) of each file."""
     for path in sorted(p for p in arguments.folder.glob("*.ply") if any(o in p.stem for o in arguments.only)):
         mesh = read(path)
         rows = np.random.default_rng(5).choice(len(mesh.points), min(POINTS, len(mesh.points)), replace=False)
         few = replace(mesh, points=mesh.points[rows], normals=mesh.normals[rows], clearance=mesh.clearance[rows])
-        truth = [methods.run(methods.bake(few, "embree", ORDER, rays=REFERENCE_RAYS, seed=seed)
+        truth = [methods.run(methods.bake(few, "embree", arguments.order, rays=REFERENCE_RAYS, seed=seed)
                              ).coefficients.astype(np.float64) for seed in (99, 98)]
+        yield path.stem, mesh, rows, truth
+
+
+def regret(arguments: argparse.Namespace) -> None:
+    """The planner beside every candidate."""
+    print(f"Order {arguments.order}, one thread, processor seconds.\n\n| mesh | vertices | tolerance | plan | s | "
+          "error | pilot s | cheapest | s | regret | less the pilot |\n|---|---|---|---|---|---|---|---|---|---|---|",
+          flush=True)
+    regrets: dict[float, list[tuple[float, float]]] = {tolerance: [] for tolerance in arguments.tolerances}
+    misses: list[float] = []
+    lowered = 0
+    for stem, mesh, rows, truth in meshes(arguments):
         measuring = [name for name in MEASURING if name != "sparse" or len(mesh.points) >= FEW_POINTS]
         fixed = [(" ".join([name, *map(str, wish.values())]),
                   *timed(mesh, rows, truth, name, arguments.repeats, **wish)[:2]) for name, wish in FIXED]
-        for tolerance in TOLERANCES:
+        for tolerance in arguments.tolerances:
             tried = fixed + [(name, *timed(mesh, rows, truth, name, arguments.repeats, tolerance=tolerance)[:2])
                              for name in measuring]
             spent, pilot, error, found = looked(mesh, rows, truth, arguments.repeats, tolerance)
             misses.append(error / tolerance)
+            lowered += found.record.order < arguments.order
             met = [(seconds, name) for name, seconds, wrong in tried if wrong <= tolerance]
             least, name = min(met) if met else (float("nan"), "none")
             free = min(pilot, max(FREE_SECONDS, FREE_SHARE * (spent - pilot)))
             regrets[tolerance].append((spent / least, (spent - free) / least))
-            plan = found.record.method + (f" {found.record.rays_per_point:.0f}" if found.record.rays else "")
-            print(f"| {path.stem} | {len(mesh.points):,} | {tolerance:.0%} | {plan} | {spent:.3f} | {error:.2%} | "
+            print(f"| {stem} | {len(mesh.points):,} | {tolerance:.0%} | {_plan(found)} | {spent:.3f} | {error:.2%} | "
                   f"{pilot:.3f} | {name} | {least:.3f} | {spent / least:.2f} | {(spent - free) / least:.2f} |",
                   flush=True)
     print("\n| tolerance | cases | median regret | 90th percentile | less the pilot: median | 90th percentile |\n"
@@ -140,9 +149,56 @@ def main() -> None:
         if len(known):
             figures = np.percentile(known, (50, 90), axis=0).T.ravel()
             print(f"| {label} | {len(known)} | " + " | ".join(f"{figure:.2f}" for figure in figures) + " |")
-    missed = [m for m in misses if m > 1]
-    print(f"\nTolerance missed in {len(missed)} of {len(misses)} cases ({len(missed) / max(len(misses), 1):.0%}), at "
-          f"worst {max(misses, default=0):.2f} times.")
+    print(f"\n{_missed(misses)} A lower order was baked in {lowered}.")
+
+
+def bands(arguments: argparse.Namespace) -> None:
+    """The planner beside itself held at the order."""
+    print(f"Order {arguments.order}, one thread, processor seconds.\n\n| mesh | vertices | tolerance | all bands | s | "
+          "error | order | plan | s | error | said | time |\n|---|---|---|---|---|---|---|---|---|---|---|---|",
+          flush=True)
+    ratios: dict[float, list[tuple[int, float, float, float, float]]] = {t: [] for t in arguments.tolerances}
+    for stem, mesh, rows, truth in meshes(arguments):
+        for tolerance in arguments.tolerances:
+            held, wrong, every = timed(mesh, rows, truth, "auto", arguments.repeats, tolerance=tolerance, whole=True)
+            spent, error, found = timed(mesh, rows, truth, "auto", arguments.repeats, tolerance=tolerance)
+            ratios[tolerance].append((found.record.order, spent, held, error / tolerance, wrong / tolerance))
+            print(f"| {stem} | {len(mesh.points):,} | {tolerance:.0%} | {_plan(every)} | {held:.3f} | {wrong:.2%} | "
+                  f"{found.record.order} | {_plan(found)} | {spent:.3f} | {error:.2%} | "
+                  f"{found.record.error_estimate or 0:.2%} | {spent / held:.2f} |", flush=True)
+    print("\n| tolerance | meshes | of a lower order | their orders | their time beside all bands: median | most | "
+          "tolerance missed | at worst | with all bands |\n|---|---|---|---|---|---|---|---|---|")
+    for tolerance, cases in ratios.items():
+        low = [case for case in cases if case[0] < arguments.order]
+        times = [spent / held for _, spent, held, _, _ in low] or [float("nan")]
+        orders = ", ".join(f"{sum(case[0] == n for case in low)} of {n}" for n in range(2, arguments.order))
+        print(f"| {tolerance:.0%} | {len(cases)} | {len(low)} | {orders} | {np.median(times):.2f} | {max(times):.2f} | "
+              f"{sum(case[3] > 1 for case in cases)} | {max(case[3] for case in cases):.2f} | "
+              f"{sum(case[4] > 1 for case in cases)} |")
+
+
+def _plan(found: Transfer) -> str:
+    return found.record.method + (f" {found.record.rays_per_point:.0f}" if found.record.rays else "")
+
+
+def _missed(misses: Sequence[float]) -> str:
+    """misses: errors over tolerances."""
+    missed = sum(m > 1 for m in misses)
+    return (f"Tolerance missed in {missed} of {len(misses)} cases ({missed / max(len(misses), 1):.0%}), at worst "
+            f"{max(misses, default=0):.2f} times.")
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--folder", type=Path, default=FOLDER / "validation")
+    parser.add_argument("--only", nargs="*", default=[""], help="files whose name has one of these in it")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--order", type=int, default=3)
+    parser.add_argument("--tolerances", type=float, nargs="*", default=TOLERANCES)
+    parser.add_argument("--bands", action="store_true", help="beside itself with all bands")
+    arguments = parser.parse_args()
+    (bands if arguments.bands else regret)(arguments)
 
 
 if __name__ == "__main__":

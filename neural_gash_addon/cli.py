@@ -48,7 +48,8 @@ def _parser() -> argparse.ArgumentParser:
                            "together, which shadow each other")
     bake.add_argument("--method", choices=list(methods.METHODS), default="auto", metavar="METHOD",
                       help="; ".join(f"{m.name}: {m.label}" for m in methods.METHODS.values()) + " (auto)")
-    bake.add_argument("--order", type=int, default=3, help="bands of spherical harmonics, 2 to 5 (3)")
+    bake.add_argument("--order", type=int, default=3, help="bands of spherical harmonics, 2 to 5 (3); with "
+                      "auto and a tolerance at most so many, as those that would not be seen are left out")
     quality = bake.add_mutually_exclusive_group()
     quality.add_argument("--rays", type=int, help="rays from every point")
     quality.add_argument("--tolerance", type=float, default=0.02, help="relative L2 error to reach (0.02)")

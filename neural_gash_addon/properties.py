@@ -86,7 +86,8 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
     order: IntProperty(  # type: ignore[valid-type]
         name="Order", default=3, min=MIN_ORDER, max=MAX_ORDER,
         description="Bands of spherical harmonics: more give crisper shadows and take more memory "
-                    "(order n stores n x n numbers for each point)")
+                    "(order n stores n x n numbers for each point). With Automatic and a tolerance it is the most: "
+                    "bands that would not be seen are left out")
     quality: EnumProperty(  # type: ignore[valid-type]
         name="Quality", description="What decides how long to trace", default=TOLERANCE,
         items=[(TOLERANCE, "Tolerance", "Trace until the error is as small as asked for, and no longer"),

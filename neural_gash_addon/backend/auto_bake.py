@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The bake as planned (`auto`): plan, run the method that was chosen, and say what would be seen better.
 
-The record has a sentence for each choice: method and rays, domain, target (and bounces, see `bounce`).
+The record has a sentence for each choice: method and rays, order, domain, target (and bounces, see `bounce`).
 """
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 from . import advice
+from .bands import Bands, all_of, of_open_sky
 from .geometry import TriangleMesh
 from .pilot import Pilot, look
-from .plan import Plan, choose, nothing_blocks
+from .plan import Plan, choose, choose_bands, nothing_blocks, traced_bands
 from .progress import scaled
 from .raycast import Geometry, Occluders
 from .transfer import Transfer
 from .workers import default_threads
 
 _PILOT_SHARE = 0.05  # of the progress
+_MANY = 1 << 18  # points that are baked at a time, where those that are looked at are but some of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,11 +30,12 @@ class Planned:
 
     plan: Plan
     scene: Occluders | None
-    pilot: Pilot | None  # None: nothing was traced
+    pilot: Pilot | None  # of the order that is baked; None: nothing was traced
+    bands: Bands
 
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None, occluders: Sequence[Geometry],
-         seed: int, threads: int | None, scene: Occluders | None = None,
+         seed: int, threads: int | None, scene: Occluders | None = None, whole: bool = False,
          bakers: Mapping[str, Callable[..., Generator[float, None, Transfer]]],
          ) -> Generator[float, None, Transfer]:
     """Bake as cheaply as the tolerance allows; arguments as `methods.bake`.
@@ -40,13 +43,14 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     bakers: the methods that a plan may name. With a number of rays there is nothing to plan but whether any is needed.
     """
     began = time.perf_counter()
-    found = yield from scaled(planned(mesh, order, rays, tolerance, occluders, seed, threads, scene), 0, _PILOT_SHARE)
-    plan, pilot = found.plan, found.pilot
+    planning = planned(mesh, order, rays, tolerance, occluders, seed, threads, scene, whole)
+    found = yield from scaled(planning, 0, _PILOT_SHARE)
+    plan, pilot, order = found.plan, found.pilot, found.bands.order
     known = {"pilot": pilot} if plan.method != "analytic" else {}
     work = bakers[plan.method](mesh, order, rays=plan.rays, tolerance=plan.tolerance, occluders=occluders, seed=seed,
                                threads=threads, scene=found.scene, **known)
     transfer = yield from scaled(work, _PILOT_SHARE, 1 - _PILOT_SHARE)
-    record = replace(transfer.record, plan=plan.reason).also(advice.domain(mesh))
+    record = replace(transfer.record, plan=plan.reason).also(found.bands.reason).also(advice.domain(mesh))
     error, probes = record.error_estimate, record.probe_rays
     if plan.method == "analytic":
         error = pilot.blocked if pilot is not None else 0.0
@@ -57,21 +61,41 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     if pilot is not None:
         probes += pilot.traced
     return Transfer(transfer.coefficients, replace(record, probe_rays=probes, seconds=time.perf_counter() - began,
-                                                   tolerance=tolerance, error_estimate=error))
+                                                   tolerance=tolerance,
+                                                   error_estimate=found.bands.whole(error)))
 
 
 def planned(mesh: TriangleMesh, order: int, rays: int | None, tolerance: float | None, occluders: Sequence[Geometry],
-            seed: int, threads: int | None, scene: Occluders | None) -> Generator[float, None, Planned]:
+            seed: int, threads: int | None, scene: Occluders | None, whole: bool = False
+            ) -> Generator[float, None, Planned]:
     """Look, and choose; arguments as `methods.bake`. Yields progress."""
+    every = all_of(order, tolerance)
     if nothing_blocks(mesh, occluders):
         return Planned(Plan("analytic", reason="Nothing rises above any point's horizon: unshadowed is exact."), scene,
-                       None)
+                       None, every if whole or tolerance is None else of_open_sky(order, tolerance))
     if tolerance is None:
         return Planned(Plan("embree", rays=rays, reason="A number of rays was asked for: they are traced from every "
-                                                        "point."), scene, None)
+                                                        "point."), scene, None, every)
     threads = threads or default_threads()
     if scene is None:
         scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
     with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
         pilot = yield from look(mesh, scene, order, tolerance, seed, pool, threads)
-    return Planned(choose(pilot, len(mesh.points), tolerance), scene, pilot)
+    if whole:
+        return Planned(choose(pilot, len(mesh.points), tolerance), scene, pilot, every)
+    plan, bands = choose_bands(pilot, len(mesh.points), order, tolerance)
+    return Planned(plan, scene, pilot if bands.order == order else pilot.to_order(bands.order), bands)
+
+
+def enough_bands(mesh: TriangleMesh, order: int, tolerance: float, occluders: Sequence[Geometry], seed: int,
+                 threads: int | None, scene: Occluders) -> Generator[float, None, Bands]:
+    """The fewest bands that are enough where the points of a mesh are but some of many, which are baked in parts.
+
+    Arguments as `methods.bake`. Yields progress.
+    """
+    if nothing_blocks(mesh, occluders):
+        return of_open_sky(order, tolerance)
+    threads = threads or default_threads()
+    with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+        pilot = yield from look(mesh, scene, order, tolerance, seed, pool, threads)
+    return traced_bands(pilot, _MANY, order, tolerance)[1]

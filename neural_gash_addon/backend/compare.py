@@ -107,11 +107,11 @@ def sample(count: int, most: int, seed: int) -> NDArray[np.int64]:
 
 
 def vertex_bake(mesh: TriangleMesh, occluders: Sequence[Geometry] = ()) -> Bake:
-    """How a setting is baked at the points of a mesh."""
+    """How a setting is baked at the points of a mesh; bands that a plan leaves out are zero."""
     def bake(setting: Setting, seed: int) -> Generator[float, None, tuple[NDArray, BakeRecord]]:
         found = yield from methods.bake(mesh, setting.method, setting.order, rays=setting.rays, seed=seed,
                                         tolerance=setting.tolerance, occluders=occluders, threads=setting.threads)
-        return found.coefficients, found.record
+        return sh.padded(found.coefficients, sh.coefficient_count(setting.order)), found.record
 
     return bake
 

@@ -44,7 +44,8 @@ def doubt(mesh: TriangleMesh, baked: NDArray[np.float32], method: str, occluders
                     clearance=turned(mesh.clearance))
     around = [(turned(np.asarray(positions, np.float64)), triangles) for positions, triangles in occluders]
     order = sh.order_of(baked.shape[1])
-    work = methods.bake(other, method, order, occluders=around, seed=seed, **quality)  # type: ignore[arg-type]
+    work = methods.bake(other, method, order, occluders=around, seed=seed, whole=True,
+                        **quality)  # type: ignore[arg-type]
     again = (yield from scaled(work, 0, 1)).coefficients
     back = sh.rotate_each(again, np.broadcast_to(_TURN.T, (len(again), 3, 3)))
     squares = np.square(back - baked).sum(1) / 2

@@ -41,6 +41,7 @@ class Method:
     bake: Callable[..., Baking]
     # what makes of a mesh and its occluders what the method sees of them; None: it sees no shadows
     sees: Callable[[TriangleMesh, Sequence[Geometry]], Any] | None = None
+    plans: bool = False  # to a tolerance, the order is the most that it bakes
 
 
 def _analytic(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
@@ -71,8 +72,9 @@ METHODS: dict[str, Method] = {m.name: m for m in (
            traces=False, bake=_analytic),
     Method("embree", "Ray traced", "Traces rays with Embree to find what blocks the light; the reference",
            traces=True, bake=embree_bake.bake, sees=_embree_scene),
-    Method("auto", "Automatic", "Looks at a few points, and takes the cheapest method that meets the tolerance",
-           traces=True, bake=_auto, sees=_embree_scene),
+    Method("auto", "Automatic", "Looks at a few points, and takes the cheapest method, and the fewest bands, that meet "
+           "the tolerance",
+           traces=True, bake=_auto, sees=_embree_scene, plans=True),
     Method("hybrid", "Few rays and network", "Traces few rays, and a small network takes the rest from neighbours: "
            "smooth at once, and exact with many rays", traces=True, bake=hybrid_bake.bake, sees=_embree_scene),
     Method("sparse", "Ray traced, sparse", "Traces some points, more where shadows change, and reads the others off "
@@ -94,12 +96,13 @@ METHODS: dict[str, Method] = {m.name: m for m in (
 def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: int | None = None,
          tolerance: float | None = None, occluders: Sequence[Geometry] = (), seed: int = 0,
          threads: int | None = None, scene: Any = None, reflection: Reflection | None = None,
-         lamps: Lamps | None = None) -> Baking:
+         lamps: Lamps | None = None, whole: bool = False) -> Baking:
     """Bake the transfer of a mesh's points.
 
     Args:
         mesh: what to bake; it blocks its own light.
-        method: a name in METHODS. order: bands, 2 to 5.
+        method: a name in METHODS. order: bands, 2 to 5; with a tolerance, a method that `plans` leaves out those
+            that would not be seen, and the record's order says how many there are.
         rays: rays for every point, or
         tolerance: relative L2 error to reach with as few rays as that takes (at most MAX_RAYS a
             point). A method that traces wants exactly one of the two.
@@ -108,6 +111,7 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
         reflection: light that bounces, if any shall; for methods that trace.
         lamps: what lights the points besides, if anything shall.
         seed: independent seeds give independent errors. threads: one a core where not given.
+        whole: all bands, whatever a plan says: for what must be alike in several bakes.
     Yields:
         Progress, 0 to 1, many times a second. `close()` stops the workers.
     Returns:
@@ -115,25 +119,30 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
     Raises:
         UserError: arguments out of range.
     """
+    check(method, order, rays, tolerance)
+    entry = METHODS[method]
+    direct = partial(entry.bake, mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed,
+                     threads=threads, **({"whole": whole} if entry.plans else {}))
+    if reflection is None or not entry.traces:
+        baking = direct(scene=scene)
+    else:
+        baking = _with_bounces(direct, mesh, occluders, scene, threads, reflection)
+    return baking if lamps is None else _with_lamps(baking, mesh, lamps, seed, threads)
+
+
+def check(method: str, order: int, rays: int | None, tolerance: float | None) -> None:
+    """UserError where `bake` has no such method, or arguments are out of range."""
     if method not in METHODS:
         raise UserError(f"There is no method '{method}'; choose one of: {', '.join(METHODS)}.")
     if not MIN_ORDER <= order <= sh.MAX_ORDER:
         raise UserError(f"The order must be {MIN_ORDER} to {sh.MAX_ORDER}, not {order}.")
-    entry = METHODS[method]
-    if entry.traces:
+    if METHODS[method].traces:
         if (rays is None) == (tolerance is None):
             raise UserError("Give either a number of rays or a tolerance.")
         if rays is not None and not 1 <= rays <= 16 * MAX_RAYS:
             raise UserError(f"The number of rays must be 1 to {16 * MAX_RAYS}, not {rays}.")
         if tolerance is not None and not MIN_TOLERANCE * (1 - 1e-6) <= tolerance <= 1:  # Blender keeps float32
             raise UserError(f"The tolerance must be {MIN_TOLERANCE:g} to 1, not {tolerance:g}.")
-    direct = partial(entry.bake, mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed,
-                     threads=threads)
-    if reflection is None or not entry.traces:
-        baking = direct(scene=scene)
-    else:
-        baking = _with_bounces(direct, mesh, occluders, scene, threads, reflection)
-    return baking if lamps is None else _with_lamps(baking, mesh, lamps, seed, threads)
 
 
 def _with_bounces(direct: Callable[..., Baking], mesh: TriangleMesh, occluders: Sequence[Geometry],

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The planner's pilot: a few points of a mesh, traced twice with rays of their own, and what they say about all.
 
-The product of the two traces gives the energy of transfer and of what is blocked, without noise; their difference the
-noise of a number of rays; and the clock what a ray costs here and now, so no table of machine speeds is kept that could
-prove wrong. The bake that is then picked goes on from it: it need not look again at what the pilot saw.
+The product of the two traces gives the energy of transfer, of its bands and of what is blocked, without noise; their
+difference the noise of a number of rays; and the clock what a ray costs here and now, so no table of machine speeds is
+kept that could prove wrong. The bake that is then picked goes on from it: it need not look again at what the pilot saw.
 """
 from __future__ import annotations
 
 import time
 from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,8 @@ _LEAST_RAYS, _MOST_RAYS = 16, 128
 _SETS = 4
 _UNEVEN = 1.1                 # of the noise of rays that are no power of two, and so no whole net, to that of such
 _BESIDES = 4.0                # what a point costs besides its rays, in rays
+_DARK = 1e-3                  # of the transfer in the open: less than this is as good as none
+_SURE = 1.3                   # standard errors of a share that are added to it, to be above it in nine cases of ten
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,32 @@ class Pilot:
     ray: float        # seconds of one
     traced: int       # rays in all
     sample: tuple[NDArray, NDArray, NDArray]  # points (n,), and the blocked part (n, K) as each trace has it
+    unshadowed: NDArray = field(default_factory=lambda: np.zeros((0, 0)))  # (n, K), of these points
+
+    def to_order(self, order: int) -> Pilot:
+        """What it would be, had it been traced at a lower order."""
+        points, one, two = self.sample
+        terms = sh.coefficient_count(order)
+        return _said((points, one[:, :terms], two[:, :terms]), self.unshadowed[:, :terms], self.rays, self.ray,
+                     self.traced)
+
+    def beyond(self, order: int) -> tuple[float, float]:
+        """What the bands from `order` on are of |T|, and a bound as of `most_blocked`; infinite in the dark."""
+        lights, _ = self._energies()
+        if float(lights.sum()) <= _DARK ** 2 * float(np.square(self.unshadowed).sum()):
+            return np.inf, np.inf
+        return _part(lights[:, sh.coefficient_count(order):].sum(1), lights.sum(1))
+
+    def without_shadows(self, order: int) -> tuple[float, float]:
+        """The error of unshadowed transfer at a lower order, of |T|, and a bound as above."""
+        lights, shadows = self._energies()
+        terms = sh.coefficient_count(order)
+        return _part(shadows[:, :terms].sum(1) + lights[:, terms:].sum(1), lights.sum(1))
+
+    def _energies(self) -> tuple[NDArray, NDArray]:
+        """(n, K) squares of transfer and of what is blocked, without noise."""
+        _, one, two = self.sample
+        return (self.unshadowed - one) * (self.unshadowed - two), one * two
 
     def noise_of(self, rays: float) -> float:
         """The relative error of a plain bake with so many rays."""
@@ -72,19 +100,31 @@ def look(mesh: TriangleMesh, scene: Occluders, order: int, tolerance: float, see
         yield from twin.trace(pool, threads, rows, 0, rays, sums)
         found.append(twin.turned_here(rows, twin.means(rows, sums, 0, rays)))
     spent = time.perf_counter() - began
-    one, two = found
     ray = spent / (2 * (rays + _BESIDES) * max(wanted, 1))
+    one, two = found
+    return _said((points, one, two), unshadowed, rays, ray, 2 * rays * wanted)
+
+
+def _said(sample: tuple[NDArray, NDArray, NDArray], unshadowed: NDArray, rays: int, ray: float, traced: int) -> Pilot:
+    """What a sample says."""
+    _, one, two = sample
     lights = ((unshadowed - one) * (unshadowed - two)).sum(1)
     energy = float(lights.sum())
-    sample = points, one, two
     if energy <= 0:
-        return Pilot(np.inf, np.inf, np.inf, rays, 0.0, ray, 2 * rays * wanted, sample)
-    shadows = (one * two).sum(1)
-    share = max(float(shadows.sum()), 0.0) / energy
-    unsure = float(np.square(shadows - share * lights).sum()) ** 0.5 / energy  # standard error of the share
+        return Pilot(np.inf, np.inf, np.inf, rays, 0.0, ray, traced, sample, unshadowed)
     noise = float(np.square(one - two).sum()) / 2 / energy
-    return Pilot(share ** 0.5, (share + 1.3 * unsure) ** 0.5, noise ** 0.5, rays, (energy / wanted) ** 0.5, ray,
-                 2 * rays * wanted, sample)
+    return Pilot(*_part((one * two).sum(1), lights), noise ** 0.5, rays, (energy / len(one)) ** 0.5, ray, traced,
+                 sample, unshadowed)
+
+
+def _part(energies: NDArray, of: NDArray) -> tuple[float, float]:
+    """Root of the share of energies (n,) in others (n,), summed over points; and with its standard error added."""
+    whole = float(of.sum())
+    if whole <= 0:
+        return np.inf, np.inf
+    share = max(float(energies.sum()), 0.0) / whole
+    unsure = float(np.square(energies - share * of).sum()) ** 0.5 / whole
+    return share ** 0.5, (share + _SURE * unsure) ** 0.5
 
 
 def sample_size(points: int) -> int:

@@ -4,7 +4,8 @@
 1. Where everything lies below the tangent plane of every point, nothing can be blocked: unshadowed transfer is exact,
    and neither a ray nor a scene is needed. A convex mesh is so.
 2. Else a pilot says how large shadows are, and what rays bring and cost (`pilot`).
-3. Each candidate is given a number of rays that meets the tolerance, and a time; the cheapest is taken. What the noise
+3. Bands whose energy would not be seen are dropped (`bands`); the rest of the tolerance is for the others.
+4. Each candidate is given a number of rays that meets the tolerance, and a time; the cheapest is taken. What the noise
    becomes with other rays, and what a hybrid or a sparse bake saves, follow laws measured on meshes (below).
 
 `gnn` is no candidate: what it saves is the scene, which the pilot has built, and at each point it costs as much as 100
@@ -17,6 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from . import bands
+from .bands import Bands
 from .embree_bake import FIRST_RAYS
 from .estimator import morton_order
 from .geometry import TriangleMesh
@@ -84,26 +87,61 @@ def nothing_blocks(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> bool:
     return True
 
 
-def choose(found: Pilot, points: int, tolerance: float) -> Plan:
-    """The cheapest plan for so many points that meets the tolerance (relative L2)."""
+def choose_bands(found: Pilot, points: int, order: int, tolerance: float) -> tuple[Plan, Bands]:
+    """The cheapest plan for so many points that meets the tolerance (relative L2) with up to so many bands, and these.
+
+    Where unshadowed is near enough, at the lowest order at which that and what is dropped are.
+    """
+    for fewer in range(bands.LEAST_ORDER, order + 1):
+        if found.without_shadows(fewer)[1] <= tolerance:
+            return _unshadowed(found.to_order(fewer)), bands.chosen(fewer, order, tolerance, _parts(found, order))
+    return traced_bands(found, points, order, tolerance)
+
+
+def traced_bands(found: Pilot, points: int, order: int, tolerance: float) -> tuple[Plan, Bands]:
+    """As `choose_bands`, where shadows are not looked at as a whole: the fewest bands that take no more time than all.
+
+    Noise goes with the bands, so that the others mostly need fewer rays, though less of the tolerance is left for them.
+    """
+    parts = _parts(found, order)
+    every = choose(found, points, tolerance)
+    for fewer in range(bands.LEAST_ORDER, order):
+        if parts[fewer][1] <= bands.MOST_DROPPED * tolerance:
+            enough, cut = bands.chosen(fewer, order, tolerance, parts), found.to_order(fewer)
+            plan = choose(cut, points, enough.left, tolerance)
+            if seconds(plan, cut, points) <= seconds(every, found, points):
+                return plan, enough
+    return every, bands.chosen(order, order, tolerance, parts)
+
+
+def _parts(found: Pilot, order: int) -> list[tuple[float, float]]:
+    return [found.beyond(fewer) for fewer in range(order)]
+
+
+def choose(found: Pilot, points: int, tolerance: float, asked: float | None = None) -> Plan:
+    """The cheapest plan for so many points that meets the tolerance (relative L2), which is what is left of another."""
     if found.most_blocked <= tolerance:
-        return Plan("analytic", reason=f"Shadows are {_percent(found.blocked)} of the whole, less than the tolerance: "
-                                       "none is traced.")
-    candidates = [(seconds(plan, found, points), plan) for plan in plans(found, points, tolerance)]
+        return _unshadowed(found)
+    candidates = [(seconds(plan, found, points), plan) for plan in plans(found, points, tolerance, asked)]
     return min(candidates, key=lambda candidate: candidate[0])[1]
 
 
-def plans(found: Pilot, points: int, tolerance: float) -> list[Plan]:
-    """Every plan that is expected to meet the tolerance by tracing."""
-    measured = _MARGIN * tolerance
+def _unshadowed(found: Pilot) -> Plan:
+    return Plan("analytic", reason=f"Shadows are {_percent(found.blocked)} of the whole, less than the tolerance: "
+                                   "none is traced.")
+
+
+def plans(found: Pilot, points: int, tolerance: float, asked: float | None = None) -> list[Plan]:
+    """Every plan that is expected to meet the tolerance by tracing; people read of what was `asked`."""
+    measured, said = _MARGIN * tolerance, _percent(asked or tolerance)
     out = [Plan("embree", tolerance=measured, reason="Rays from every point, more where shadows are harder, are the "
-                                                      f"quickest way to {_percent(tolerance)}.")]
+                                                      f"quickest way to {said}.")]
     enough = [rays for rays in _FEW_RAYS if _SAFE * found.noise_of(rays) <= tolerance]
     if enough:
         out.append(Plan("embree", rays=enough[0], reason=f"Shadows are {_percent(found.blocked)} of the whole, so "
-                        f"{enough[0]} rays a point are enough for {_percent(tolerance)}."))
+                        f"{enough[0]} rays a point are enough for {said}."))
     out.append(Plan("hybrid", tolerance=tolerance, reason="Few rays, averaged over neighbours by the network, are the "
-                                                          f"quickest way to {_percent(tolerance)}."))
+                                                          f"quickest way to {said}."))
     if points >= SPARSE_POINTS:
         out.append(Plan("sparse", tolerance=measured, reason=f"{points:,} points are dense: some are traced, and the "
                                                               "others read off them."))
@@ -112,6 +150,8 @@ def plans(found: Pilot, points: int, tolerance: float) -> list[Plan]:
 
 def seconds(plan: Plan, found: Pilot, points: int) -> float:
     """What a plan is expected to take, the scene aside, which all have alike."""
+    if plan.method == "analytic":
+        return 0.0
     assert plan.rays is not None or plan.tolerance is not None
     if plan.method == "embree":
         rays = plan.rays or max(found.needed_rays(plan.tolerance or 1.0), 2.0 * FIRST_RAYS)

@@ -21,7 +21,7 @@ from .geometry import Surface, TriangleMesh
 from .progress import scaled
 from .raster import Coverage, Layout
 from .raycast import Geometry, Occluders
-from .texels import NormalMap, texel_points
+from .texels import NormalMap, scattered, texel_points
 from .unwrap import Charts, lay_out
 
 TRIALS = (32, 64, 128, 256, 512, 1024, 2048)  # texels a side
@@ -49,9 +49,8 @@ def fitting_side(surface: Surface, uv: NDArray, *, error: float, method: str = "
     Returns:
         Texels a side, TRIALS[0] to MAX_FIT, a multiple of 16.
     """
-    faces, weights = _sample(surface, np.random.default_rng(seed))
-    places = np.einsum("nc,ncx->nx", weights, uv[surface.corners[faces]])
-    sample = Coverage(1, np.arange(len(faces)), faces, weights, weights)
+    sample = scattered(surface, _POINTS, np.random.default_rng(seed))
+    places = np.einsum("nc,ncx->nx", sample.barycentric, uv[surface.corners[sample.faces]])
     points = texel_points(surface, sample, normal_maps)
     scene = None
     if methods.METHODS[method].sees:
@@ -92,17 +91,6 @@ def fitting_density(charts: Charts, trial: Trial) -> Generator[float, None, floa
             side *= 2
     fitting = yield from scaled(trial(atlas.uv), 0.5, 0.5)
     return atlas.texels_per_metre * fitting / atlas.side
-
-
-def _sample(surface: Surface, generator: np.random.Generator) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Random points by area: triangles (n,) and barycentrics (n, 3)."""
-    places = surface.positions[surface.triangles]
-    area = np.linalg.norm(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]), axis=1)
-    total = float(area.sum())
-    faces = generator.choice(len(area), _POINTS, p=area / total if total > 0 else None)
-    a, b = generator.random((2, _POINTS))
-    root = np.sqrt(a)
-    return faces.astype(np.int32), np.stack([1 - root, root * (1 - b), root * b], 1)
 
 
 def _around(coverage: Coverage, places: NDArray) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -34,6 +34,12 @@ def order_of(count: int) -> int:
     return order
 
 
+def padded(coefficients: NDArray, count: int) -> NDArray:
+    """Coefficients (N, n) followed by zeros: (N, count). The same function, at a higher order."""
+    missing = count - coefficients.shape[1]
+    return coefficients if not missing else np.pad(coefficients, ((0, 0), (0, missing)))
+
+
 def band_slice(band: int) -> slice:
     """Where band l lies in the flat index."""
     return slice(band * band, (band + 1) * (band + 1))

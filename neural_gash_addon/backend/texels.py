@@ -63,6 +63,18 @@ def texel_points(surface: Surface, coverage: Coverage, normal_maps: Sequence[Nor
                         np.zeros(0, np.int32), TEXEL, surface.resolution, texels=coverage.texels, side=coverage.side)
 
 
+def scattered(surface: Surface, count: int, generator: np.random.Generator) -> Coverage:
+    """Random places on the surface by area, as if they were texels."""
+    places = surface.positions[surface.triangles]
+    area = np.linalg.norm(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]), axis=1)
+    total = float(area.sum())
+    faces = generator.choice(len(area), count, p=area / total if total > 0 else None).astype(np.int32)
+    a, b = generator.random((2, count))
+    root = np.sqrt(a)
+    weights = np.stack([1 - root, root * (1 - b), root * b], 1)
+    return Coverage(1, np.arange(count), faces, weights, weights)
+
+
 def _mapped(normal_map: NormalMap, corners: NDArray, weights: NDArray, smooth: NDArray) -> NDArray[np.float64]:
     """(n, 3) shading normals of points in triangles of these corners (n, 3), as Cycles' Normal Map node has them."""
     uv = np.einsum("nc,ncx->nx", weights, normal_map.uv[corners].astype(np.float64))

@@ -14,7 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import methods
+from . import spherical_harmonics as sh
 from .atlas import Part, place
+from .auto_bake import enough_bands
+from .bands import all_of
 from .bounce import Reflection
 from .errors import UserError
 from .exchange import atomic, reason
@@ -24,10 +27,11 @@ from .progress import scaled
 from .raster import Layout
 from .raycast import Geometry
 from .record import IDENTITY, BakeRecord
-from .texels import NormalMap, fill_map, mirrored, texel_points
+from .texels import NormalMap, fill_map, mirrored, scattered, texel_points
 
 CHANNELS = 4             # coefficients that one image holds
 _LAYOUT_SHARE = 0.1      # of the progress
+_POINTS = 4096           # of the surface, of which some say what order is enough for all tiles
 _TILE = 1 << 18          # texels of a tile, covered or not: some seconds of work
 _OURS = re.compile(r"\d{4}\.(npy|json)")
 _JOB = "job.json"
@@ -88,7 +92,7 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
          side: int | None = None, texels_per_metre: float | None = None, padding: int = 2, rays: int | None = None,
          tolerance: float | None = None, occluders: Sequence[Geometry] = (),
          normal_maps: Sequence[NormalMap] = (), seed: int = 0, threads: int | None = None, folder: Path | None = None,
-         key: str = "", reflection: Reflection | None = None, lamps: Lamps | None = None
+         key: str = "", reflection: Reflection | None = None, lamps: Lamps | None = None, whole: bool = False
          ) -> Generator[float, None, TextureTransfer]:
     """Bake the transfer of a texture's texels.
 
@@ -96,8 +100,9 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
         uv: (C, 2) of each face corner, 0 to 1, without overlaps; an atlas is made where not given.
         side: texels a side, or, for an atlas, texels_per_metre to have it as large as that takes.
         padding: texels between the charts of an atlas.
-        method, order, rays, tolerance, occluders, seed, threads: as `methods.bake`; a tolerance is
-            met by every tile.
+        method, order, rays, tolerance, occluders, seed, threads, whole: as `methods.bake`; a tolerance is
+            met by every tile. Where a plan leaves bands out, it does in all tiles alike, as their borders would be
+            seen, and the tolerance is met by the whole.
         folder: where finished tiles are kept, so that a bake that was killed goes on from there and
             gives the same numbers. key: what tells this bake from others in the same folder.
         reflection: light that bounces, if any shall. lamps: what lights the texels besides.
@@ -106,6 +111,7 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
     Raises:
         UserError: arguments out of range, UVs outside the texture, or faces that overlap in it.
     """
+    methods.check(method, order, rays, tolerance)
     began = time.perf_counter()
     placing = place([Part(surface, uv)], side=side, texels_per_metre=texels_per_metre, padding=padding)
     (placed,), side = yield from scaled(placing, 0, _LAYOUT_SHARE)
@@ -114,6 +120,14 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
     digest = hashlib.blake2b(uv.tobytes(), digest_size=16).hexdigest()
     store = _Store(folder, f"{key} {side} {digest}") if folder is not None else None
     scene: Any = None
+    bands = all_of(order, tolerance)
+    sees = methods.METHODS[method].sees
+    if methods.METHODS[method].plans and tolerance is not None and not whole and sees:
+        some = texel_points(surface, scattered(surface, _POINTS, np.random.default_rng([seed, 7])), normal_maps)
+        scene = sees(some, occluders)
+        looking = enough_bands(some, order, tolerance, occluders, seed, threads, scene)
+        bands = yield from scaled(looking, _LAYOUT_SHARE, 0)
+    left = tolerance if bands.order == order else max(bands.left, methods.MIN_TOLERANCE)
     rows = max(1, _TILE // side)
     texels, values, inside, records = [], [], [], []
     for number, start in enumerate(range(0, side, rows)):
@@ -123,14 +137,14 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
         yield done
         if not len(coverage.texels):
             continue
-        found = store.load(number, len(coverage.texels)) if store else None
+        found = store.load(number, len(coverage.texels), bands.order) if store else None
         if found is None:
             mesh = texel_points(surface, coverage, normal_maps)
-            if scene is None and (sees := methods.METHODS[method].sees):
+            if scene is None and sees:
                 scene = sees(mesh, occluders)
-            baking = methods.bake(mesh, method, order, rays=rays, tolerance=tolerance, seed=_tile_seed(seed, number),
-                                  occluders=occluders, threads=threads, scene=scene, reflection=reflection,
-                                  lamps=lamps)
+            baking = methods.bake(mesh, method, bands.order, rays=rays, tolerance=left, whole=True,
+                                  seed=_tile_seed(seed, number), occluders=occluders, threads=threads, scene=scene,
+                                  reflection=reflection, lamps=lamps)
             transfer = yield from scaled(baking, done, share)
             found = transfer.coefficients.reshape(len(mesh.points), -1), transfer.record
             if transfer.irradiance is not None:
@@ -146,17 +160,29 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
     terms = records[0].terms
     coefficients = [v[:, :terms] for v in values]
     irradiance = None if lamps is None else [v[:, terms:] for v in values]
-    record = replace(_whole(records, map(_energy, coefficients), map(_energy, irradiance or ())), seed=seed,
-                     seconds=time.perf_counter() - began, target="texture", side=side, single_faces=placed.single_faces)
+    record = _whole(records, map(_energy, coefficients), map(_energy, irradiance or ())).also(bands.reason)
+    if tolerance is not None and records[0].tolerance is not None:
+        record = replace(record, tolerance=tolerance, error_estimate=bands.whole(record.error_estimate))
+    record = replace(record, seed=seed, seconds=time.perf_counter() - began, target="texture", side=side,
+                     single_faces=placed.single_faces)
     return TextureTransfer(uv, texels, coefficients, inside, record, irradiance)
 
 
 def alike(transfers: Sequence[TextureTransfer]) -> list[TextureTransfer]:
-    """The same, all of them coloured if one is, so that one texture can hold them."""
+    """The same, all of them coloured if one is, and of the highest order, so that one texture can hold them.
+
+    Bands that a plan left out are zero.
+    """
     colours = max(t.record.colours for t in transfers)
-    return [t if t.record.colours == colours else
-            replace(t, coefficients=[np.repeat(c, colours, axis=1) for c in t.coefficients],
-                    record=replace(t.record, colours=colours)) for t in transfers]
+    order = max(t.record.order for t in transfers)
+
+    def like(values: NDArray[np.float32], own: int) -> NDArray[np.float32]:
+        values = values if own == colours else np.repeat(values, colours, axis=1)
+        return sh.padded(values, colours * order * order)
+
+    return [t if (t.record.colours, t.record.order) == (colours, order) else
+            replace(t, coefficients=[like(c, t.record.colours) for c in t.coefficients],
+                    record=replace(t.record, colours=colours, order=order)) for t in transfers]
 
 
 def merged(transfers: Sequence[TextureTransfer]) -> TextureTransfer:
@@ -225,14 +251,15 @@ class _Store:
         except OSError as error:
             raise UserError(f"Tiles cannot be kept in '{folder}' ({reason(error)}).") from error
 
-    def load(self, number: int, points: int) -> tuple[NDArray[np.float32], BakeRecord] | None:
-        """A finished tile; None where it is not there."""
+    def load(self, number: int, points: int, order: int) -> tuple[NDArray[np.float32], BakeRecord] | None:
+        """A finished tile; None where it is not there, or of another order."""
         try:
             record = BakeRecord.from_json((self._folder / f"{number:04d}.json").read_text())
             coefficients = np.load(self._folder / f"{number:04d}.npy", mmap_mode="r")
         except (OSError, ValueError, UserError):
             return None
-        return (coefficients, record) if coefficients.shape == (points, record.numbers) else None
+        whole = coefficients.shape == (points, record.numbers)
+        return (coefficients, record) if whole and record.order == order else None
 
     def save(self, number: int, coefficients: NDArray[np.float32], record: BakeRecord
              ) -> tuple[NDArray[np.float32], BakeRecord]:

@@ -109,7 +109,7 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
         before = fingerprint(obj, depsgraph, mode, texture.part.uv, reflection is not None)
         key = _key(settings, before, read.matrix, maps, lit)
         bake = partial(bake_texture, read.surface, **what, **quality, folder=tiles, reflection=reflection, key=key,
-                       lamps=lit)
+                       lamps=lit, whole=settings.gloss)  # metals show the high bands, which dull surfaces do not
     else:
         before = fingerprint(obj, depsgraph, mode, bounces=reflection is not None)
         key = _key(settings, before, read.matrix, (), lit)
@@ -168,7 +168,7 @@ def _key(settings: NeuralGashSettings, shape: str, matrix: NDArray, maps: Sequen
                       + f"{normal_map.strength} {normal_map.extension}".encode())
     chosen = {name: getattr(settings, name) for name in
               ("method", "order", "quality", "rays", "tolerance", "sizing", "side", "texels_per_metre", "padding",
-               "bounces", "share")}
+               "bounces", "share", "gloss")}
     return json.dumps({"version": VERSION, "shape": shape, "place": digest.hexdigest(),
                        "lamps": "" if lamps is None else f"{lamps.key} {lamps.learned}", **chosen}, sort_keys=True)
 

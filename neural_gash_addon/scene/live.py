@@ -212,7 +212,7 @@ def _as_bake(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types
     if bounces and methods.METHODS[settings.method].traces:
         check_attributes(before.order)
         reflection = read_reflection(obj, before.occluders, depsgraph, bounces)
-    return methods.run(methods.bake(mesh, settings.method, before.order, reflection=reflection,
+    return methods.run(methods.bake(mesh, settings.method, before.order, reflection=reflection, whole=True,
                                     occluders=read_occluders(obj, before.occluders, depsgraph), **settings.tracing()))
 
 

@@ -24,10 +24,11 @@ def sentences(record):
 
 def test_a_shadow_inside_a_face_that_its_corners_miss_is_said():
     coarse, fine = (TriangleMesh.from_triangles(*grid(n)) for n in (2, 60))
-    method, _, target = sentences(bake(coarse, tolerance=0.1, occluders=[TABLE]).record)
+    method, order, _, target = sentences(bake(coarse, tolerance=0.1, occluders=[TABLE]).record)
     assert target.startswith("Shadow edges inside faces are missed by their corners (") and "a texture of" in target
     assert method.startswith("Shadows are")  # at the corners there is next to none, so nothing is traced
-    target = sentences(bake(fine, tolerance=0.1, occluders=[TABLE]).record)[2]
+    assert order == "Band 2 is 34 % of the whole: order 3 is kept."
+    target = sentences(bake(fine, tolerance=0.1, occluders=[TABLE]).record)[3]
     assert target.startswith("Shadows inside faces follow their corners") and target.endswith("vertices are enough.")
 
 
@@ -40,7 +41,7 @@ def test_the_texture_that_is_advised_is_about_as_large_as_one_fitted_to_the_erro
     fitted = methods.run(resolution.fitting_side(surface, positions[triangles.ravel(), :2], error=tolerance, order=3,
                                                  occluders=[TABLE]))
     for seed in range(3):
-        target = sentences(bake(mesh, tolerance=tolerance, occluders=[TABLE], seed=seed).record)[2]
+        target = sentences(bake(mesh, tolerance=tolerance, occluders=[TABLE], seed=seed).record)[3]
         side = int(re.search(r"about (\d+)", target)[1]) * advice._FULL ** 0.5  # the floor fills its texture
         assert fitted / 4 < side < 4 * fitted
 
@@ -67,12 +68,12 @@ def test_lookups_around_a_point_are_bilinear():
 def test_the_domain_is_explained(smooth, words):
     for shape, tolerance in ((torus(), 0.1), (sphere(2), 0.1)):
         found = bake(TriangleMesh.from_triangles(*shape, smooth=smooth), tolerance=tolerance)
-        assert words in sentences(found.record)[1]
+        assert words in sentences(found.record)[2]
 
 
 def test_one_sentence_for_each_choice_and_none_where_a_method_was_chosen():
     mesh = TriangleMesh.from_triangles(*torus())
-    assert len(sentences(bake(mesh, tolerance=0.05).record)) == 3
+    assert len(sentences(bake(mesh, tolerance=0.05).record)) == 4
     assert len(sentences(bake(mesh, rays=16).record)) == 2
     assert methods.run(methods.bake(mesh, "embree", tolerance=0.05)).record.plan == ""
 
@@ -80,6 +81,6 @@ def test_one_sentence_for_each_choice_and_none_where_a_method_was_chosen():
 def test_split_normals_without_corners_and_darkness_give_no_sentence():
     from dataclasses import replace
     mesh = replace(TriangleMesh.from_triangles(*torus(), smooth=False), corners=None)
-    assert len(sentences(bake(mesh, tolerance=0.1).record)) == 2
+    assert len(sentences(bake(mesh, tolerance=0.1).record)) == 3
     dark = TriangleMesh.from_triangles(sphere(3)[0], sphere(3)[1][:, ::-1])
     assert len(sentences(bake(dark, tolerance=0.1).record)) == 2
