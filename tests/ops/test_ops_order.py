@@ -98,18 +98,21 @@ def test_all_frames_of_a_sequence_have_the_order_asked_for(sheet, draft, tmp_pat
     quiet(capfd)
 
 
-def test_live_keeps_the_order_of_the_bake(sheet, draft):
+@pytest.mark.parametrize(("baked", "order"), [(1, 3), (3, 5)])
+def test_live_keeps_the_order_of_the_bake(sheet, draft, baked, order):
+    """Flat in frame 1, folded in 3: where a plan would take more bands, and fewer."""
     obj = sheet()
-    bpy.context.scene.frame_set(1)
+    bpy.context.scene.frame_set(baked)
     bake(obj)
+    assert _record(obj).order == order
     draft.live = True
-    for frame in (2, 3):  # folded, where a plan would take more bands
+    for frame in (2, 4 - baked):
         bpy.context.scene.frame_set(frame)
         record = _record(obj)
-        assert record.order == 3 and stored(obj).shape[1] == 9 and not record.plan.startswith("Live")
+        assert record.order == order and stored(obj).shape[1] == order ** 2 and not record.plan.startswith("Live")
     draft.live = False
     bake(obj)
-    assert _record(obj).order == 5
+    assert _record(obj).order == 8 - order
 
 
 def test_compare_and_confidence_of_fewer_bands(make, draft):
