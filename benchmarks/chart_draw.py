@@ -24,16 +24,15 @@ LABELS = {"srr": "SRR (1: no better than no shadows)", "rel_l2": "relative L2 er
           "openness": "relative L2 error of openness (ambient occlusion)"}
 PEER_LABELS = {"trimesh": "trimesh + embreex, plain", "open3d": "Open3D, plain", "cycles-ao": "Cycles AO bake"}
 _OURS_MARKS, _PEER_MARKS = "osD^vP*X", "<>1"
+_PEER_COLOURS = ("black", "midnightblue", "darkorange")
 
 
 def _style(method: str) -> dict[str, Any]:
     """Colour and mark, by the place in the table, so that a method is the same in every picture."""
-    names = [*METHODS, *PEER_LABELS]
-    number = names.index(method)
     ours = method in METHODS
     marks = _OURS_MARKS if ours else _PEER_MARKS
-    place = number if ours else number - len(METHODS)
-    return {"color": f"C{number % 10}", "marker": marks[place % len(marks)],
+    place = list(METHODS if ours else PEER_LABELS).index(method)
+    return {"color": f"C{place % 10}" if ours else _PEER_COLOURS[place], "marker": marks[place % len(marks)],
             "label": METHODS[method].label if ours else PEER_LABELS[method], "linestyle": "-" if ours else ":"}
 
 

@@ -18,7 +18,7 @@ _LEAST = 1e-6  # error below which all are shown alike
 _GREY, _BLACK = (0.85, 0.85, 0.85), (0.0, 0.0, 0.0)
 _COLOURS: tuple[Colour, ...] = ((0.12, 0.47, 0.71), (0.95, 0.45, 0.0), (0.17, 0.63, 0.17), (0.84, 0.15, 0.16),
                                 (0.58, 0.4, 0.74), (0.55, 0.34, 0.29), (0.89, 0.47, 0.76), (0.35, 0.35, 0.35),
-                                (0.09, 0.7, 0.75))
+                                (0.09, 0.7, 0.75), (0.7, 0.7, 0.1))
 # of an error, from none to the most: dark blue, violet, orange, light yellow, as they shall be shown
 _HEAT = np.array([[0.05, 0.03, 0.35], [0.5, 0.05, 0.6], [0.95, 0.45, 0.2], [1.0, 0.95, 0.6]])
 

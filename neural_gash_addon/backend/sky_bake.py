@@ -98,10 +98,10 @@ def traced(points: TriangleMesh, occluders: Occluders, order: int, rays: int, se
 
 
 def scene_points(mesh: TriangleMesh, occluders: Occluders, count: int = POINTS, rays: int = RAYS, *, seed: int = 0,
-                 threads: int | None = None, order: int = sh.MAX_ORDER) -> Generator[float, None, ScenePoints]:
+                 threads: int | None = None) -> Generator[float, None, ScenePoints]:
     """What the network reads of a mesh; what else blocks its light is in what its points see. Yields progress."""
     points = on_surface(mesh, count, seed)
-    blocked = yield from traced(points, occluders, order, rays, seed, threads or default_threads())
+    blocked = yield from traced(points, occluders, sh.MAX_ORDER, rays, seed, threads or default_threads())
     return ScenePoints(in_scale(points.points, occluders), points.normals.astype(np.float32),
                        split(blocked, points.normals), rays)
 
@@ -177,7 +177,7 @@ def encoded(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> Sky | None:
 
 def _encode(scene: Occluders, mesh: TriangleMesh, seed: int, threads: int) -> Generator[float, None, Sky | None]:
     model = network()
-    points = yield from scene_points(mesh, scene, seed=seed, threads=threads)
+    points = yield from scene_points(mesh, scene, POINTS, seed=seed, threads=threads)
     if not len(points.places):
         return None
     torch = import_torch("embedding")
