@@ -2,8 +2,8 @@
 """Where methods fail: a table of trials and methods, `python benchmarks/stability.py [--quick]`.
 
 A cell has the typical error (RMS over points, median over the disturbed cases), the worst of any point, and the largest
-ratio of a case's RMS to that of the same mesh undisturbed. Trials that are in the file of numbers already are not run
-again; remove it to start afresh.
+ratio of a case's RMS to that of the same mesh undisturbed. Methods that are in the file of numbers already are not
+tried again (but that of --again is); remove it to start afresh.
 """
 from __future__ import annotations
 
@@ -190,11 +190,26 @@ def _save(path: Path | None, results: dict[str, Any]) -> None:
             draft.write_text(json.dumps(results, indent=0) + "\n", encoding="utf-8")
 
 
+def _missing(rows: Sequence[dict], chosen: Sequence[Setting]) -> list[Setting]:
+    """The settings whose methods are in none of the rows."""
+    there = {row["method"] for row in rows}
+    return [setting for setting in chosen if setting.method not in there]
+
+
+def _with(part: dict[str, Any] | None, name: str, rows: list[dict]) -> dict[str, Any]:
+    """A part of the results with rows added, in the order of the table of methods, and of which commits they are."""
+    whole, now = [*(part or {}).get(name, []), *rows], about()
+    commits = sorted({*(part or {}).get("commit", now["commit"]).split(", "), now["commit"]})
+    whole.sort(key=lambda row: list(methods.METHODS).index(row["method"]))
+    return {**now, "commit": ", ".join(commits), name: whole}
+
+
 def main() -> int:
     """Run all trials and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="small procedural meshes")
     parser.add_argument("--only", help="trials whose name has this in it")
+    parser.add_argument("--again", choices=methods.METHODS, help="try this method anew, as it is another now")
     parser.add_argument("--out", type=Path, help="a file for the numbers, as JSON")
     parser.add_argument("--page", type=Path, help="page whose tables are replaced by this run's")
     arguments = parser.parse_args()
@@ -206,21 +221,25 @@ def main() -> int:
     results: dict[str, Any] = {"trials": {}, "noise": {}}
     if arguments.out and arguments.out.is_file():
         results = json.loads(arguments.out.read_text(encoding="utf-8"))
+        for part, name in [*((trial, "cells") for trial in results["trials"].values()), (results["noise"], "rows")]:
+            if name in part:
+                part[name] = [row for row in part[name] if row["method"] != arguments.again]
     with tqdm(trials, unit="trial") as bar:
         for group, trial in bar:
             bar.set_description(trial.__name__)
-            if trial.__name__ not in results["trials"]:
-                found = [asdict(cell) for cell in tried(group, trial, scale, chosen)]
-                results["trials"][trial.__name__] = {**about(), "cells": found}
+            if missing := _missing(results["trials"].get(trial.__name__, {}).get("cells", []), chosen):
+                found = [asdict(cell) for cell in tried(group, trial, scale, missing)]
+                results["trials"][trial.__name__] = _with(results["trials"].get(trial.__name__), "cells", found)
                 _save(arguments.out, results)
-    if not arguments.only and not results["noise"]:
-        results["noise"] = {**about(), "rows": noise(scale, chosen)}
+    if not arguments.only and (missing := _missing(results["noise"].get("rows", []), chosen)):
+        results["noise"] = _with(results["noise"], "rows", noise(scale, missing))
         _save(arguments.out, results)
     if not arguments.only and not results.get("rooms"):
         results["rooms"] = {**about(), "rows": trials_rooms.tried(8 if arguments.quick else 1)}
         _save(arguments.out, results)
     parts = [part for part in (*results["trials"].values(), results["noise"], results.get("rooms")) if part]
-    machines, commits = (", ".join(sorted({part[name] for part in parts})) for name in ("machine", "commit"))
+    machines = "; ".join(sorted({part["machine"] for part in parts}))
+    commits = ", ".join(sorted({commit for part in parts for commit in part["commit"].split(", ")}))
     cells = [Cell(**cell) for _, trial in trials for cell in results["trials"][trial.__name__]["cells"]]
     texts = {"origin": f"Machine: {machines}. Commit: {commits}. Seed 0; {REFERENCE_SEED} of the references.",
              "table": table(cells), "noise": noise_table(results["noise"].get("rows", [])), "red": red_list(cells),

@@ -29,7 +29,8 @@ from .scene_points import CANDIDATES, TURN, farthest
 from .transfer import Transfer
 from .workers import default_threads
 
-POINTS, RAYS = 4096, 64        # scene points, and rays from each: noisy at one, and not over a neighbourhood
+POINTS, RAYS = 4096, 64        # scene points at least, and rays from each: noisy at one, and not over a neighbourhood
+MOST, ASKING = 16_384, 4       # and at most: one for so many points that ask, so that they are not most of the work
 CHECKED, CHECKS = 128, 64      # points that are traced twice to know the error; rays of each
 QUERIES_AT_ONCE = 4096         # decoded together, so that memory does not grow with their number
 _ENCODING = 0.3                # of the progress
@@ -177,7 +178,8 @@ def encoded(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> Sky | None:
 
 def _encode(scene: Occluders, mesh: TriangleMesh, seed: int, threads: int) -> Generator[float, None, Sky | None]:
     model = network()
-    points = yield from scene_points(mesh, scene, POINTS, seed=seed, threads=threads)
+    count = min(max(POINTS, len(mesh.points) // ASKING), MOST)
+    points = yield from scene_points(mesh, scene, count, seed=seed, threads=threads)
     if not len(points.places):
         return None
     torch = import_torch("embedding")
