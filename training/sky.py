@@ -31,7 +31,7 @@ from . import data, labels, loop
 from .curves import draw
 
 NAME = "sky"
-STEPS, RATE, EVERY = 2_400, 1.5e-3, 100
+STEPS, RATE, EVERY = 3_000, 1.5e-3, 100
 QUERIES = 2048       # of a step
 LOOKS = 2            # traces of the scene points, each with rays of its own
 MOST_POINTS = 40_000
