@@ -21,6 +21,7 @@ from .hybrid import Layer, Network
 
 FOLDER = Path(__file__).parent / "networks"
 HYBRID, GNN, EMBEDDING = "hybrid.safetensors", "gnn.safetensors", "embedding.safetensors"
+RADIANCE = "radiance.safetensors"  # beside that one, of which it reads the codes
 CHECKSUMS = "checksums.json"  # file name -> SHA-256, beside the weights
 
 
