@@ -17,7 +17,7 @@ import numpy as np
 from memory import _megabytes
 
 POINTS = (4096, 12_800, 51_200, 200_000)
-QUERIES = (16_384, 65_536, 262_144, 1_048_576)
+QUERIES = (16_384, 65_536, 262_144, 1_048_576, 4_194_304)
 FEW = 16_384  # queries of a room when its points vary, and
 USUAL = 4096  # points of a room when its queries vary
 
@@ -79,7 +79,7 @@ def main() -> None:
     if arguments.child:
         _child(*arguments.child)
         return
-    most = 2 if arguments.quick else 4
+    most = 2 if arguments.quick else 5
     points, queries = POINTS[:most], QUERIES[:most]
     print("| scene points | encoder, s | MB | a query, us |\n|---|---|---|---|")
     found = [measured(count, FEW) for count in points]

@@ -32,15 +32,16 @@ from neural_gash_addon.backend.raycast import Occluders
 
 from . import data, rooms
 
-VERSION = 2            # raised whenever the same job gives other labels
+VERSION = 3            # raised whenever the same job gives other labels
 CACHE = data.CACHE / "rooms"
 TRAIN, VALIDATION, EVALUATION = "train", "validation", "evaluation"
 TRAIN_RAYS, VALIDATION_RAYS = 512, 2048  # for reflected light
 DIRECT_RAYS = 256      # for light straight from emitters
 QUERIES = 2048
 LOOKS = 4              # independent ones at the light of the scene points, so that their noise is not learned by heart
-KEYS = ("scene_points", "point_direct", "point_indirect", "queries", "direct", "direct_noise", "indirect",
-        "indirect_noise", "seed", "split")
+ORDER = 5              # bands of reflected light by direction
+KEYS = ("scene_points", "point_direct", "point_indirect", "point_shape", "queries", "direct", "direct_noise",
+        "indirect", "indirect_noise", "shape", "shape_noise", "seed", "split")
 _FIRST = {TRAIN: 0, VALIDATION: 1_000_000, EVALUATION: 2_000_000}  # seeds: no room is in two of them
 CORNELL = -1           # instead of a seed
 _SCENES = 2_900_000    # number of the first scene of a file, likewise
@@ -134,9 +135,11 @@ def label(scene: LitScene, *, seed: int, split: str, rays: int, points: int = PO
 
     Returns:
         scene_points (M, 9) position, unit normal, albedo, so ordered that its first points are a good sample too, and
-        the light there as `lit_points` has it: point_direct (M, 3), point_indirect (LOOKS, M, 3); queries (N, 9) as
-        scene_points; direct, indirect (N, 3) irradiance straight from emitters and reflected, and direct_noise,
-        indirect_noise (N, 3), their standard errors; seed; split. All float32.
+        the light there as `lit_points` has it: point_direct (M, 3), point_indirect (LOOKS, M, 3), point_shape
+        (LOOKS, M, K, 3), float16; queries (N, 9) as scene_points; direct, indirect (N, 3) irradiance straight from
+        emitters and reflected, and direct_noise, indirect_noise (N, 3), their standard errors; shape (N, K, 3) of
+        ORDER, reflected light by direction (`irradiance.Irradiance`), and shape_noise (N, ORDER, 3), the root of the
+        sum of its squared standard errors in each band; seed; split. All else float32.
     """
     number, occluders = abs(seed), scene.occluders()
     asked = visible_points(scene, queries, number, occluders)
@@ -144,17 +147,19 @@ def label(scene: LitScene, *, seed: int, split: str, rays: int, points: int = PO
     def traced(at: NDArray, normals: NDArray, paths: int, straight: bool, look: int) -> irradiance.Irradiance:
         return methods.run(irradiance.irradiance(
             scene, at, normals, paths, depth=1 if straight else irradiance.DEPTH, straight=straight,
-            seed=number + look * 10_000_000, threads=threads, occluders=occluders))
+            seed=number + look * 10_000_000, threads=threads, occluders=occluders, order=0 if straight else ORDER))
 
-    lit = methods.run(lit_points(scene, occluders, points, seed=number, threads=threads))
-    looks = [lit.indirect, *(traced(lit.places, lit.normals, REFLECTED, False, look).values
-                             for look in range(1, LOOKS))]
+    lit = methods.run(lit_points(scene, occluders, points, seed=number, threads=threads, order=ORDER))
+    others = [traced(lit.places, lit.normals, REFLECTED, False, look) for look in range(1, LOOKS)]
     direct = traced(asked[:, :3], asked[:, 3:6], DIRECT_RAYS, True, LOOKS)
     indirect = traced(asked[:, :3], asked[:, 3:6], rays, False, LOOKS)
     return {"scene_points": np.concatenate([lit.places, lit.normals, lit.albedo], 1), "point_direct": lit.direct,
-            "point_indirect": np.stack(looks), "queries": asked, "direct": direct.values, "direct_noise": direct.error,
-            "indirect": indirect.values, "indirect_noise": indirect.error, "seed": np.array(seed),
-            "split": np.array(split)}
+            "point_indirect": np.stack([lit.indirect, *(other.values for other in others)]),
+            "point_shape": np.stack([lit.shape, *(other.shape for other in others)]).astype(np.float16),
+            "queries": asked, "direct": direct.values, "direct_noise": direct.error, "indirect": indirect.values,
+            "indirect_noise": indirect.error, "shape": indirect.shape,
+            "shape_noise": np.sqrt(np.add.reduceat(np.square(indirect.shape_error), np.arange(ORDER) ** 2, axis=1)),
+            "seed": np.array(seed), "split": np.array(split)}
 
 
 def work(job: Job, path: Path) -> Outcome:

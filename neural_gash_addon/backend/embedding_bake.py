@@ -2,8 +2,8 @@
 """Irradiance in a room by the light-transport embedding: encode the room once, then ask for any points. Needs torch.
 
 Light straight from emitters is path traced at each point, where it has little noise. What was reflected is traced at
-scene points alone, with few paths, and the network says from them what it is anywhere, but for gaps between things
-that are narrower than its codes are apart: there, it is traced too.
+scene points alone, with few paths, and the network says from them what it is anywhere; where asked, by direction, too.
+But in gaps between things that are narrower than its codes are apart, it is traced as well.
 """
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from . import embedding, weights
 from . import irradiance as tracing
+from . import spherical_harmonics as sh
 from .enclosed import NEAR, enclosed
 from .errors import UserError
 from .geometry import NOT_FINITE
@@ -47,63 +48,93 @@ def network() -> Any:
     return model.to("cuda" if torch.cuda.is_available() else "cpu").eval()
 
 
-def encoded(scene: LitScene, *, seed: int = 0, threads: int | None = None, occluders: Occluders | None = None
-            ) -> Generator[float, None, Room | None]:
+def radiance_network(model: Any) -> Any:
+    """The trained radiance decoder that reads the codes of `network()`: networks.radiance.Radiance, likewise.
+
+    Raises:
+        UserError: no weights, or not those that were trained.
+    """
+    import torch
+
+    from .networks.radiance import Radiance
+
+    decoder = Radiance(model.settings)
+    arrays = weights.load(weights.FOLDER / weights.RADIANCE)
+    decoder.load_state_dict({key: torch.from_numpy(array.copy()) for key, array in arrays.items()})
+    return decoder.to(next(model.parameters()).device).eval()
+
+
+def encoded(scene: LitScene, *, seed: int = 0, threads: int | None = None, occluders: Occluders | None = None,
+            directions: bool = False) -> Generator[float, None, Room | None]:
     """A scene's room, to be asked by `irradiance` any number of times; None where no surface has an area.
 
+    Args:
+        directions: it can be asked for light by direction, too.
     Raises:
         UserError: no torch or weights, or a room larger than the network knows.
     """
     refuse_larger(scene.positions[scene.triangles])
     model = network()
-    lit = yield from lit_points(scene, occluders or scene.occluders(), seed=seed, threads=threads)
-    return Room(model, lit) if len(lit.places) else None
+    decoder = radiance_network(model) if directions else None
+    lit = yield from lit_points(scene, occluders or scene.occluders(), seed=seed, threads=threads,
+                                order=0 if decoder is None else decoder.order)
+    return Room(model, lit, decoder) if len(lit.places) else None
 
 
 def irradiance(scene: LitScene, points: NDArray, normals: NDArray, *, seed: int = 0, threads: int | None = None,
-               occluders: Occluders | None = None, clearance: NDArray | None = None, room: Room | None = None
-               ) -> Generator[float, None, Irradiance]:
+               occluders: Occluders | None = None, clearance: NDArray | None = None, room: Room | None = None,
+               order: int = 0) -> Generator[float, None, Irradiance]:
     """Light that arrives at points, as `irradiance.irradiance` gives it: direct light traced, reflected light learned.
 
     Args:
         points: (N, 3) metres. normals: (N, 3) unit; where it is zero, the irradiance is.
         occluders: `scene.occluders()`, if it is there already. clearance: (N, 3), as `irradiance.irradiance`.
-        room: of the scene, if it is there already.
+        room: of the scene, if it is there already; encoded with `directions` where there is an order.
+        order: bands of light by direction, at most those of the network, 5; 0 for none. It has no `shape_error`.
     Returns:
         `error` is that of direct light, by its paths, and of reflected light, by how far off the network is at CHECKED
         of the points: one share of all values; at those in gaps (`enclosed`), by their paths.
     Raises:
         UserError: no torch or weights, points that are not finite, or a room larger than the network knows.
+        ValueError: a higher order than the network's.
     """
+    if order > sh.MAX_ORDER:
+        raise ValueError(f"order {order} is above {sh.MAX_ORDER}, which the network was trained with")
     points, normals = np.asarray(points, np.float64), np.asarray(normals, np.float64)
     if not (np.isfinite(points).all() and np.isfinite(normals).all()):
         raise UserError(NOT_FINITE)
     if not len(scene.emitters):
         values, error = np.zeros((2, len(points), 3), np.float32)
-        return Irradiance(values, error, tracing.DARK)
+        return Irradiance(values, error, tracing.DARK,
+                          np.zeros((len(points), order * order, 3), np.float32) if order else None)
     occluders = occluders or scene.occluders()
     clearance = normals if clearance is None else clearance
 
-    def traced(rows: NDArray, rays: int, straight: bool, start: float, share: float
+    def traced(rows: NDArray, rays: int, straight: bool, start: float, share: float, bands: int
                ) -> Generator[float, None, Irradiance]:
         return (yield from scaled(tracing.irradiance(
             scene, points[rows], normals[rows], rays, depth=1 if straight else tracing.DEPTH, straight=straight,
-            seed=seed + 1, threads=threads, occluders=occluders, clearance=clearance[rows]), start, share))
+            seed=seed + 1, threads=threads, occluders=occluders, clearance=clearance[rows],
+            order=bands), start, share))
 
     if room is None:
-        room = yield from scaled(encoded(scene, seed=seed, threads=threads, occluders=occluders), 0.0, 0.3)
-    direct = yield from traced(np.arange(len(points)), STRAIGHT, True, 0.3, 0.3)
+        room = yield from scaled(encoded(scene, seed=seed, threads=threads, occluders=occluders,
+                                         directions=bool(order)), 0.0, 0.3)
+    direct = yield from traced(np.arange(len(points)), STRAIGHT, True, 0.3, 0.3, order)
     if room is None:
         return direct
-    found = yield from scaled(room.reflected(points, normals, direct.values), 0.6, 0.2)
+    found, shape = yield from scaled(room.reflected_from(points, normals, direct.values, order), 0.6, 0.2)
     within = enclosed(points, normals, clearance, NEAR * room.spacing(points), occluders, seed)
     gaps, others = np.flatnonzero(within), np.flatnonzero(~within & normals.any(1))
-    paths = yield from traced(gaps, ENCLOSED, False, 0.8, 0.1)
+    paths = yield from traced(gaps, ENCLOSED, False, 0.8, 0.1, order)
     checked = np.random.default_rng([seed, 11]).permutation(others)[:CHECKED]
-    truth = yield from traced(checked, CHECKS, False, 0.9, 0.1)
+    truth = yield from traced(checked, CHECKS, False, 0.9, 0.1, 0)
     error = _share_off(found[checked], truth) * found
     found[gaps], error[gaps] = paths.values, paths.error
-    return Irradiance(direct.values + found, np.hypot(direct.error, error).astype(np.float32))
+    if paths.shape is not None:
+        shape[gaps] = paths.shape
+    return Irradiance(direct.values + found, np.hypot(direct.error, error).astype(np.float32), "",
+                      None if direct.shape is None else direct.shape + shape)
 
 
 def _share_off(found: NDArray, truth: Irradiance) -> float:
@@ -126,17 +157,19 @@ def refuse_larger(places: NDArray) -> None:
 class Room:
     """A room's codes, which answer for any point."""
 
-    def __init__(self, model: Any, points: LitPoints) -> None:
+    def __init__(self, model: Any, points: LitPoints, radiance: Any = None) -> None:
         """Encode at least one point.
 
         Args:
             model: networks.embedding.Embedding, on its device, in `eval` mode.
+            radiance: networks.radiance.Radiance, likewise, where light by direction is asked; of its order are the
+                points' shapes.
         """
         import torch
 
         from .networks.embedding import Frame, level
 
-        self.model, self._where = model, next(model.parameters()).device
+        self.model, self.radiance, self._where = model, radiance, next(model.parameters()).device
         sizes = model.settings
         self._centre = np.mean(points.places, axis=0, dtype=np.float64)
         self._layout = embedding.layout(points.places, sizes.gathered, sizes.around)
@@ -147,29 +180,49 @@ class Room:
         unit = self.level.clamp_min(1e-30)[:, None]
         with torch.no_grad():
             self.codes = model.encoder(self._frame, albedo, direct / unit, indirect / unit)
+            if radiance is not None:
+                assert points.shape is not None
+                self._beyond = radiance.encode(
+                    self.codes, self._frame, indirect / unit, self._tensor(points.shape.transpose(2, 0, 1)) /
+                    unit[..., None], self._tensor(sh.cosine_lobe(points.normals, radiance.order)))
 
     def reflected(self, points: NDArray, normals: NDArray, direct: NDArray
                   ) -> Generator[float, None, NDArray[np.float32]]:
-        """(N, 3) reflected light at points.
+        """(N, 3) reflected light at points; see `reflected_from`."""
+        found, _ = yield from self.reflected_from(points, normals, direct, 0)
+        return found
+
+    def reflected_from(self, points: NDArray, normals: NDArray, direct: NDArray, order: int
+                       ) -> Generator[float, None, tuple[NDArray[np.float32], NDArray[np.float32]]]:
+        """(N, 3) reflected light at points, and the same by direction (N, K, 3), as `irradiance.Irradiance` has it.
 
         Args:
             points: (N, 3) metres. normals: (N, 3) unit; where it is zero, so is the light.
             direct: (N, 3) light straight from emitters.
+            order: bands, at most those of `radiance`; 0 for none.
         """
         import torch
 
         out, unit = np.zeros((len(points), 3), np.float32), self.level[:, None]
+        shape, terms = np.zeros((len(points), order * order, 3), np.float32), order * order
         for start in range(0, len(points), QUERIES_AT_ONCE):
             rows = slice(start, start + QUERIES_AT_ONCE)
             near = torch.from_numpy(nearest_to(points[rows], self._anchors, self.model.settings.neighbours))
+            near = near.to(self._where)
+            places, facing = self._tensor(points[rows] - self._centre), self._tensor(normals[rows])
+            straight = self._tensor(direct[rows].T) / unit.clamp_min(1e-30)
             with torch.no_grad():
-                found = self.model.decoder(self.codes, self._frame, self._tensor(points[rows] - self._centre),
-                                           self._tensor(normals[rows]),
-                                           self._tensor(direct[rows].T) / unit.clamp_min(1e-30), near.to(self._where))
+                found = self.model.decoder(self.codes, self._frame, places, facing, straight, near)
                 out[rows] = (found * unit).T.cpu().numpy()
+                if order:
+                    lobes = self._tensor(sh.cosine_lobe(normals[rows], self.radiance.order))
+                    by_way = self.radiance(self.codes, self._beyond, self._frame, places, facing, lobes, straight,
+                                           found, near)[..., :terms]
+                    shape[rows] = (by_way * unit[..., None]).permute(1, 2, 0).cpu().numpy()
             yield min(rows.stop / len(points), 1.0)
-        out[~np.any(normals, axis=1)] = 0
-        return out
+        dark = ~np.any(normals, axis=1)
+        out[dark], shape[dark] = 0, 0
+        return out, shape
 
     def spacing(self, points: NDArray) -> NDArray[np.float32]:
         """(N,) metres between codes, about, at points (N, 3)."""

@@ -6,6 +6,10 @@ point on an emitter chosen by power, and from the emitter that the path's own ne
 joins both (Veach and Guibas 1995), so a wall beside a lamp is as quiet as one far off. Paths end by Russian roulette
 in proportion to what they still carry. At the points themselves, directions and emitters are scrambled nets.
 
+Beside irradiance, where asked, the same paths tell the light by direction: what each brings, times the harmonics of the
+direction in which it left the point, is an estimate of radiance times cosine, as `gloss.transferred` has it of the sky.
+Without the cosine its variance would be infinite, as few of the paths graze.
+
 Computed in Occluders' coordinates, where irradiance is the same; arrays are (3, n), which NumPy goes through faster,
 and tables that are looked up at random have rows.
 """
@@ -18,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import sampling
+from . import spherical_harmonics as sh
 from .bounce import spread
 from .errors import UserError
 from .geometry import NOT_FINITE
@@ -43,11 +48,13 @@ class Irradiance:
     values: Floats    # (N, 3) W/m^2
     error: Floats     # (N, 3) standard error of each
     notice: str = ""  # what a person should know, if there is anything
+    shape: Floats | None = None  # (N, K, 3) where asked: integral of radiance, cosine and Y_k; [:, 0] / Y_0 is values
+    shape_error: Floats | None = None  # (N, K, 3) standard error of each
 
 
 def irradiance(scene: LitScene, points: NDArray, normals: NDArray, rays: int = RAYS, *, depth: int = DEPTH,
                straight: bool = True, seed: int = 0, threads: int | None = None, occluders: Occluders | None = None,
-               clearance: NDArray | None = None) -> Generator[float, None, Irradiance]:
+               clearance: NDArray | None = None, order: int = 0) -> Generator[float, None, Irradiance]:
     """Light that arrives at points from all emitters, direct and reflected up to depth - 1 times.
 
     Args:
@@ -56,6 +63,7 @@ def irradiance(scene: LitScene, points: NDArray, normals: NDArray, rays: int = R
         straight: whether what comes straight from emitters counts, or only what was reflected.
         occluders: `scene.occluders()`, if it is there already.
         clearance: (N, 3) from points to where their rays start (see TriangleMesh); along the normals where not given.
+        order: bands of `shape`, world axes; 0 for none.
     Yields:
         Progress, 0 to 1. Closing the generator stops the workers.
     Raises:
@@ -68,9 +76,10 @@ def irradiance(scene: LitScene, points: NDArray, normals: NDArray, rays: int = R
     if not (np.isfinite(points).all() and np.isfinite(normals).all()):
         raise UserError(NOT_FINITE)
     values, error = np.zeros((2, len(points), 3), np.float32)
+    shapes = np.zeros((2, len(points), order * order, 3), np.float32) if order else (None, None)
     if not len(scene.emitters):
-        return Irradiance(values, error, DARK)
-    tracer = _Tracer(scene, occluders or scene.occluders(), -(-rays // BATCHES), depth, straight, seed)
+        return Irradiance(values, error, DARK, *shapes)
+    tracer = _Tracer(scene, occluders or scene.occluders(), -(-rays // BATCHES), depth, straight, seed, order)
     lit = np.flatnonzero(np.any(normals != 0, axis=1))
     step = max(1, _PATHS_AT_ONCE // (BATCHES * tracer.paths))
     jobs = [lit[start:start + step] for start in range(0, len(lit), step)]
@@ -78,22 +87,24 @@ def irradiance(scene: LitScene, points: NDArray, normals: NDArray, rays: int = R
 
     def part(job: tuple[NDArray, np.random.SeedSequence]) -> None:
         rows, own = job
-        # (n, BATCHES, 3)
-        batches = tracer.trace(points[rows], normals[rows], clearance[rows], np.random.default_rng(own))
-        values[rows] = batches.mean(1)
-        error[rows] = batches.std(1, ddof=1) / BATCHES ** 0.5
+        found = tracer.trace(points[rows], normals[rows], clearance[rows], np.random.default_rng(own))
+        # (n, BATCHES, ...)
+        for (mean, deviation), batches in zip(((values, error), shapes), found, strict=True):
+            if mean is not None and deviation is not None:
+                mean[rows] = batches.mean(1)
+                deviation[rows] = batches.std(1, ddof=1) / BATCHES ** 0.5
 
     yield from spread(part, list(zip(jobs, seeds, strict=True)), threads or default_threads())
-    return Irradiance(values, error)
+    return Irradiance(values, error, "", *shapes)
 
 
 class _Tracer:
     """The scene as tables of float32 that waves of paths look up."""
 
-    def __init__(self, scene: LitScene, occluders: Occluders, paths: int, depth: int, straight: bool, seed: int
-                 ) -> None:
-        """paths: of a batch, from each point."""
-        self.paths, self._depth, self._straight = paths, depth, straight
+    def __init__(self, scene: LitScene, occluders: Occluders, paths: int, depth: int, straight: bool, seed: int,
+                 order: int) -> None:
+        """paths: of a batch, from each point. order: bands of light by direction, 0 for none."""
+        self.paths, self._depth, self._straight, self._order = paths, depth, straight, order
         self._scene, self._occluders = scene, occluders
         self._offset = np.float32(occluders.offset)
         corners = ((scene.corners - occluders.centre) * occluders.scale).transpose(1, 2, 0)  # (corner, axis, F)
@@ -118,8 +129,8 @@ class _Tracer:
         self._nets = ((nets.transpose(2, 0, 1) + 0.5) / 2.0 ** 32).astype(np.float32)        # (2, sets, paths)
 
     def trace(self, points: NDArray, normals: NDArray, clearance: NDArray, rng: np.random.Generator
-              ) -> NDArray[np.float64]:
-        """Irradiance at points (n, 3) by each batch of paths: (n, BATCHES, 3)."""
+              ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Irradiance at points (n, 3) by each batch of paths (n, BATCHES, 3), by direction (n, BATCHES, K, 3)."""
         each = BATCHES * self.paths
         count = len(points) * each
         gathered = np.zeros((3, count), np.float32)  # by each path, over pi
@@ -127,7 +138,9 @@ class _Tracer:
         frames = sampling.frames(normals, np.zeros(len(normals))).astype(np.float32)
         tangents, bitangents, up = (frames[:, :, k].T.repeat(each, axis=1) for k in range(3))
         carried = np.ones((3, count), np.float32)
+        straight: Floats | None = None  # as gathered, what is in `shape` already
         path = np.arange(count)
+        shape: NDArray[np.float64] | float = 0.0
         for vertex in range(self._depth):
             n = len(path)
             if not n:
@@ -136,11 +149,16 @@ class _Tracer:
                                else rng.random((2, 2, n), np.float32))
             counts = vertex > 0 or self._straight
             if counts:
-                self._gather_emitters(gathered, path, carried, origins, up, towards)
+                ways = self._gather_emitters(gathered, path, carried, origins, up, towards)
+                if vertex == 0 and self._order:
+                    shape = self._shape(gathered, ways, len(points))
+                    straight, gathered = gathered, np.zeros_like(gathered)
             radius, angle = np.sqrt(around[0]), around[1] * np.float32(2 * np.pi)
             cosine = np.sqrt(1 - around[0])
             directions = tangents * (radius * np.cos(angle)) + bitangents * (radius * np.sin(angle)) + up * cosine
             faces, u, v, _ = self._occluders.first(_rows(origins), _rows(directions))
+            if vertex == 0:
+                first = directions
             if counts:
                 self._gather_met(gathered, path, carried, origins, directions, cosine, faces, u, v)
             if vertex == self._depth - 1:
@@ -155,8 +173,19 @@ class _Tracer:
             tangents, bitangents, up = found[9:12], found[12:15], found[15:18]
             up = up * -np.sign(_dot(up, directions))  # of the side that was met
             origins = found[:3] + u * found[3:6] + v * found[6:9] + self._offset * up
+        if self._order:
+            shape = shape + self._shape(gathered, first, len(points))
+            gathered = gathered if straight is None else gathered + straight
         sums = gathered.reshape(3, len(points), BATCHES, self.paths).sum(3, dtype=np.float64)
-        return np.pi / self.paths * sums.transpose(1, 2, 0)
+        return np.pi / self.paths * sums.transpose(1, 2, 0), np.asarray(shape)
+
+    def _shape(self, gathered: Floats, ways: Floats, points: int) -> NDArray[np.float64]:
+        """(points, BATCHES, K, 3) of what paths brought (3, count) from ways (3, count) of any length."""
+        length = np.sqrt(np.maximum(_dot(ways, ways), 1e-30))
+        harmonics = sh.evaluate((ways / length).T, self._order).reshape(points, BATCHES, self.paths, -1)
+        brought = gathered.T.reshape(points, BATCHES, self.paths, 3)
+        found: NDArray[np.float64] = np.pi / self.paths * (harmonics.transpose(0, 1, 3, 2) @ brought)
+        return found
 
     def _net(self, rng: np.random.Generator, batches: int) -> Floats:
         """(2, batches * paths): of each batch one of the nets, shifted at random."""
@@ -165,13 +194,16 @@ class _Tracer:
         return np.minimum(shifted - np.floor(shifted), _BELOW_ONE).reshape(2, -1)
 
     def _gather_emitters(self, gathered: Floats, path: NDArray, carried: Floats, origins: Floats, up: Floats,
-                         pairs: Floats) -> None:
-        """Add what comes from a point on an emitter, chosen by pairs (2, n), unless something is between."""
+                         pairs: Floats) -> Floats:
+        """Add what comes from a point on an emitter, chosen by pairs (2, n), unless something is between.
+
+        Returns the ways to it (3, n).
+        """
         chosen, u, v = sampling.on_triangles(self._cumulative, pairs)
         faces = self._emitters[chosen]
         found = self._faces.take(faces, 0).T
         there = found[15:18]
-        ways = found[:3] + u * found[3:6] + v * found[6:9] - origins
+        towards = ways = found[:3] + u * found[3:6] + v * found[6:9] - origins
         above, facing = _dot(ways, up), -_dot(ways, there)
         good = np.flatnonzero((above > 0) & ((facing > 0) | self._behind[faces] & (facing < 0)))
         faces, facing, ways = faces[good], facing[good], ways.take(good, 1)
@@ -181,6 +213,7 @@ class _Tracer:
         good, faces = good[free], faces[free]
         form = above[good] * np.abs(facing[free]) / (np.float32(np.pi) * square[free] ** 2)
         self._add(gathered, path, carried, good, faces, form / (self._density[faces] + self._meeting[faces] * form))
+        return towards
 
     def _gather_met(self, gathered: Floats, path: NDArray, carried: Floats, origins: Floats, directions: Floats,
                     cosine: Floats, faces: NDArray, u: Floats, v: Floats) -> None:

@@ -30,33 +30,35 @@ class LitPoints:
     albedo: Floats    # (M, 3)
     direct: Floats    # (M, 3) irradiance straight from emitters, W/m^2
     indirect: Floats  # (M, 3) irradiance that was reflected, with the noise of REFLECTED paths
+    shape: Floats | None = None  # (M, K, 3) where asked: the same by direction, see `irradiance.Irradiance`
 
 
 def lit_points(scene: LitScene, occluders: Occluders, count: int = POINTS, paths: int = REFLECTED, *, seed: int = 0,
-               threads: int | None = None) -> Generator[float, None, LitPoints]:
+               threads: int | None = None, order: int = 0) -> Generator[float, None, LitPoints]:
     """Points on the surfaces of a scene, lit. Where a front is dark and its back is not, the point is of its back.
 
     Rooms are often modelled with normals outwards; what is solid is dark inside.
 
     Args:
-        count: of points. paths: from each, for reflected light.
+        count: of points. paths: from each, for reflected light. order: bands of `shape`; 0 for none.
     Yields:
         Progress, 0 to 1.
     """
     points = scene_points(scene, count, seed)
     places, normals = points[:, :3], points[:, 3:6].copy()
 
-    def traced(rows: NDArray) -> Generator[float, None, tuple[Floats, Floats]]:
+    def traced(rows: NDArray) -> Generator[float, None, tuple[Floats, Floats, Floats]]:
         found = []
         for part, (rays, straight) in enumerate(((STRAIGHT, True), (paths, False))):
             found.append((yield from scaled(irradiance.irradiance(
                 scene, places[rows], normals[rows], rays, depth=1 if straight else irradiance.DEPTH, straight=straight,
-                seed=seed, threads=threads, occluders=occluders), part / 2, 1 / 2)).values)
-        return found[0], found[1]
+                seed=seed, threads=threads, occluders=occluders, order=0 if straight else order), part / 2, 1 / 2)))
+        shape = found[1].shape
+        return found[0].values, found[1].values, np.zeros((len(rows), 0, 3), np.float32) if shape is None else shape
 
-    direct, indirect = yield from scaled(traced(np.arange(len(points))), 0.0, 0.8)
+    direct, indirect, shape = yield from scaled(traced(np.arange(len(points))), 0.0, 0.8)
     dark = np.flatnonzero(~(direct.any(1) | indirect.any(1)))
     normals[dark] *= -1
-    direct[dark], indirect[dark] = yield from scaled(traced(dark), 0.8, 0.2)
+    direct[dark], indirect[dark], shape[dark] = yield from scaled(traced(dark), 0.8, 0.2)
     normals[dark[~(direct[dark].any(1) | indirect[dark].any(1))]] *= -1
-    return LitPoints(places, normals, points[:, 6:9], direct, indirect)
+    return LitPoints(places, normals, points[:, 6:9], direct, indirect, shape if order else None)

@@ -20,7 +20,8 @@ from .exchange import atomic
 from .hybrid import Layer, Network
 
 FOLDER = Path(__file__).parent / "networks"
-HYBRID, GNN, EMBEDDING, SKY = (f"{name}.safetensors" for name in ("hybrid", "gnn", "embedding", "sky"))
+HYBRID, GNN, SKY = "hybrid.safetensors", "gnn.safetensors", "sky.safetensors"
+EMBEDDING, RADIANCE = "embedding.safetensors", "radiance.safetensors"  # the latter reads the codes of the former
 CHECKSUMS = "checksums.json"  # file name -> SHA-256, beside the weights
 
 

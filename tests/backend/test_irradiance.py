@@ -5,6 +5,7 @@ import pytest
 
 from neural_gash_addon.backend import irradiance as paths
 from neural_gash_addon.backend import methods
+from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.errors import UserError
 from neural_gash_addon.backend.lit_scene import LitScene
 from neural_gash_addon.backend.pictures import Picture
@@ -188,12 +189,102 @@ def test_the_same_for_any_threads_and_another_for_another_seed():
     assert (one.values != other.values).any()
 
 
+# --- by direction ---
+
+def test_even_light_by_direction_is_the_cosine_lobe():
+    scene = scene_of((*shapes.cube(inside=True), 0.0, (2.0, 1.0, 0.5)))
+    normals = np.array([[0, 0, 1.0], [0.6, 0, 0.8], [-0.48, 0.6, 0.64]])
+    found = run(scene, np.zeros((3, 3)), normals, 4096, order=5)
+    expected = np.pi * sh.cosine_lobe(normals, 5)[:, :, None] * [2, 1, 0.5]
+    assert found.shape.shape == found.shape_error.shape == (3, 25, 3)
+    np.testing.assert_allclose(found.shape, expected, atol=0.02)
+    assert (found.shape_error < 0.02).all()
+
+
+def test_a_small_light_by_direction_is_the_harmonics_there():
+    """Below a lamp of 5 cm, 4 m off and seen at a slant; and of a second, of another colour, both at once."""
+    lamps = [(*ceiling(0.025, 4.0), 0.0, (900, 0, 0)), (*ceiling(0.025, 3.0), 0.0, (0, 0, 500))]
+    lamps[0][0][:, 0] += 2.0
+    lamps[1][0][:, 1] -= 1.5
+    found = run(scene_of(*lamps), [0, 0, 0], UP, 4096, order=5)
+    for channel, place, radiance in ((0, [2.0, 0, 4], 900), (2, [0, -1.5, 3], 500)):
+        way = np.array(place) / np.linalg.norm(place)
+        power = radiance * 0.05 ** 2 * way[2] ** 2 / np.dot(place, place)
+        assert found.values[0, channel] == pytest.approx(power, rel=5e-3)
+        np.testing.assert_allclose(found.shape[0, :, channel], power * sh.evaluate(way[None], 5)[0], atol=5e-3 * power)
+    assert not found.shape[0, :, 1].any()
+
+
+@pytest.mark.parametrize("straight", [True, False])
+def test_irradiance_follows_from_light_by_direction_and_is_the_same_without_it(straight):
+    scene = textured_box()
+    points = np.array([[0.1, 0.2, -0.5], [-0.5, 0.1, 0.1], [0.3, -0.3, -0.5]])
+    normals = np.array([[0, 0, 1.0], [1, 0, 0], [0, 0, 1]])
+    found = run(scene, points, normals, 512, order=3, straight=straight)
+    np.testing.assert_allclose(found.shape[:, 0], found.values * sh.normalisation(0, 0), rtol=1e-5)
+    np.testing.assert_allclose(found.shape_error[:, 0], found.error * sh.normalisation(0, 0), rtol=1e-3)
+    alone = run(scene, points, normals, 512, straight=straight)
+    assert alone.shape is None and alone.shape_error is None
+    np.testing.assert_allclose(alone.values, found.values, rtol=1e-5)
+
+
+def test_the_parts_add_up_by_direction():
+    scene, points, normals = textured_box(), [[-0.2, -0.2, -0.5]], UP
+    parts = [run(scene, points, normals, 8192, order=5, seed=seed, **more)
+             for seed, more in enumerate((dict(), dict(depth=1), dict(straight=False)))]
+    off = parts[0].shape - parts[1].shape - parts[2].shape
+    noise = np.sqrt(sum(np.square(part.shape_error) for part in parts))
+    assert np.abs(off / noise).max() < 5 and (noise < 0.05 * parts[0].shape[0, 0].max()).all()
+
+
+def test_light_by_direction_in_a_box_agrees_with_mitsuba():
+    """Radiance along cosine-distributed rays, by its path integrator, times harmonics."""
+    mi = pytest.importorskip("mitsuba", reason="needs mitsuba, a development dependency, as an independent renderer")
+    mi.set_variant("scalar_rgb")
+    walls, light = shapes.cube(inside=True, subdivisions=0), ceiling(0.25, 0.45)
+    red = walls[0][walls[1]].mean(1)[:, 0] < -0.45
+    parts = [(walls[0], walls[1][~red], (0.7, 0.7, 0.7), 0), (walls[0], walls[1][red], (0.7, 0.1, 0.1), 0),
+             (*light, (0.4, 0.4, 0.4), (6, 5, 4))]
+    point, normal = np.array([0.15, -0.2, -0.5]), UP[0]
+    world = {"type": "scene"}
+    for index, (positions, triangles, albedo, emission) in enumerate(parts):
+        properties = mi.Properties()
+        properties["bsdf"] = mi.load_dict({"type": "twosided", "material": {
+            "type": "diffuse", "reflectance": {"type": "rgb", "value": list(albedo)}}})
+        if np.any(emission):
+            properties["emitter"] = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": list(emission)}})
+        shape = mi.Mesh(f"part{index}", len(positions), len(triangles), props=properties)
+        parameters = mi.traverse(shape)
+        parameters["vertex_positions"] = positions.astype(np.float32).ravel()
+        parameters["faces"] = triangles.astype(np.uint32).ravel()
+        parameters.update()
+        world[f"part{index}"] = shape
+    world = mi.load_dict(world)
+    integrator = mi.load_dict({"type": "path", "max_depth": paths.DEPTH, "rr_depth": 100})
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0)
+    rng, count = np.random.default_rng(0), 6000
+    ways = normal + _on_sphere(rng, count)
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    radiance = np.array([np.array(integrator.sample(world, sampler, mi.RayDifferential3f(
+        mi.Ray3f(list(point + 1e-4 * normal), list(way))))[0]) for way in ways])
+    each = np.pi * sh.evaluate(ways, 5)[:, :, None] * radiance[:, None]
+    expected, noise = each.mean(0), each.std(0) / count ** 0.5
+    front = np.arange(sum(len(part[1]) for part in parts)) >= 0  # Mitsuba's lights shine from their fronts alone
+    found = run(scene_of(*parts, front_only=front), point, normal, 16384, order=5)
+    score = (found.shape[0] - expected) / np.hypot(noise, found.shape_error[0])
+    assert np.abs(score).max() < 4.5 and np.sqrt(np.mean(score ** 2)) < 1.6
+    assert np.median(noise) < 0.02 * expected[0].mean()  # and the agreement means something
+
+
 # --- bad input ---
 
 def test_no_emitter_gives_zero_and_says_so():
     scene = scene_of((*shapes.cube(inside=True), 0.5, 0.0))
     found = run(scene, [0, 0, -0.5], UP)
     assert not found.values.any() and not found.error.any() and "emits" in found.notice
+    dark = run(scene, [0, 0, -0.5], UP, order=3)
+    assert dark.shape.shape == (1, 9, 3) and not dark.shape.any() and "emits" in dark.notice
     assert run(textured_box(), [0, 0, -0.5], UP, 64).notice == ""
 
 
@@ -203,8 +294,8 @@ def test_sealed_open_and_degenerate_give_no_nan():
                      (*quad((0, 0, 1), (1, 0, 1), (2, 0, 1), (3, 0, 1)), 0.5, 0))
     points = np.array([[0, 0, 0.0], [0, 0, 0.5], [0, 0, 5], [0, 0, 1], [1e4, 0, 0]])
     with np.errstate(all="raise"):
-        found = run(scene, points, np.repeat(UP, 5, 0), 256)
-    assert np.isfinite(found.values).all() and np.isfinite(found.error).all()
+        found = run(scene, points, np.repeat(UP, 5, 0), 256, order=5)
+    assert all(np.isfinite(each).all() for each in (found.values, found.error, found.shape, found.shape_error))
     assert not found.values[0].any()   # within the cube
     assert (found.values[1] > 0.1).all()
     assert not found.values[2].any()   # looks away, into the open

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from neural_gash_addon.backend import irradiance, methods
+from neural_gash_addon.backend import spherical_harmonics as sh
 from training import floor_plans, room_labels, rooms
 
 SMALL = dict(points=64, queries=48)
@@ -24,10 +25,16 @@ def test_a_file_holds_what_it_promises(tmp_path):
     for job, path in zip(jobs, paths, strict=True):
         found = load(path)
         assert [found.pop(key).shape for key in room_labels.KEYS] == [
-            (64, 9), (64, 3), (room_labels.LOOKS, 64, 3), (48, 9), *[(48, 3)] * 4, (), ()]
+            (64, 9), (64, 3), (room_labels.LOOKS, 64, 3), (room_labels.LOOKS, 64, 25, 3), (48, 9), *[(48, 3)] * 4,
+            (48, 25, 3), (48, 5, 3), (), ()]
         assert not found
         found = load(path)
-        assert all(found[key].dtype == np.float32 and np.isfinite(found[key]).all() for key in room_labels.KEYS[:8])
+        assert all(found[key].dtype == (np.float16 if key == "point_shape" else np.float32)
+                   and np.isfinite(found[key]).all() for key in room_labels.KEYS[:-2])
+        for shape, light, close in (("point_shape", "point_indirect", 2e-3), ("shape", "indirect", 1e-5),
+                                    ("shape_noise", "indirect_noise", 1e-3)):
+            np.testing.assert_allclose(found[shape][..., 0, :], found[light] * sh.normalisation(0, 0), rtol=close,
+                                       atol=1e-5)
         assert found["seed"] == job.seed and str(found["split"]) == job.split
         assert found["direct"].max() > 0 and found["indirect"].max() > 0 and (found["indirect_noise"] >= 0).all()
         for points in (found["scene_points"], found["queries"]):
