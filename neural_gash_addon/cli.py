@@ -198,7 +198,8 @@ def _relight(arguments: argparse.Namespace) -> tuple[list[dict], str]:
         obj = choose([o for o in bpy.context.scene.objects if has_bake(o)], arguments.object, "baked")
         record = read_record(obj)
         if arguments.gloss and not can_gloss(record):
-            raise UserError(f"--gloss needs a texture without bounces or lamps, which the bake of '{obj.name}' is not.")
+            raise UserError("--gloss needs a texture without bounces, and with lamps one that was baked with --gloss; "
+                            f"the bake of '{obj.name}' is not.")
         scene = bpy.context.scene
         if arguments.hdri is None:
             lighting.take_light(scene)

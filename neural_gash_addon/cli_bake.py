@@ -31,8 +31,6 @@ def check_bake(arguments: argparse.Namespace) -> None:
         raise UserError("With --uv-map a texture has no texels per metre; give --texture a number of texels, or fit.")
     if arguments.gloss and (arguments.texture is None or arguments.bounces):
         raise UserError("--gloss belongs to a bake with --texture and without --bounces.")
-    if arguments.gloss and (arguments.lamps or arguments.lamps_network):
-        raise UserError("--gloss shows no lamps; leave out one of --gloss and --lamps.")
     if not methods.METHODS[arguments.method].traces and (arguments.rays is not None or arguments.bounces):
         raise UserError(f"The method '{arguments.method}' traces nothing; leave out --rays and --bounces.")
     if arguments.texture is not None and arguments.npz is not None:

@@ -47,6 +47,9 @@ class Lamps:
     # Whether what surfaces reflect is the network's, and direct light alone is traced; needs torch. None: where that
     # keeps to the tolerance and is quicker.
     learned: bool | None = False
+    # Bands of light by direction, for gloss: with more than one, transfer gets (N, 3 order²) numbers instead of (N, 3):
+    # irradiance, and then the other harmonics of radiance times cosine (`irradiance.Irradiance.shape`), in RGB.
+    order: int = 1
     _room: Any = None         # embedding_bake.Room, once it has been encoded
 
     @cached_property
@@ -58,12 +61,20 @@ class Lamps:
         """The transfer of a mesh's points with the irradiance at them."""
         began = time.perf_counter()
         found, rays, why = yield from (self._predicted if self.learned else self._traced)(mesh, seed, threads)
-        record = replace(transfer.record.also(why), lamps=self.key, lamps_rays=rays * len(mesh.points),
-                         lamps_error=relative(found),
+        light = found.values
+        if found.shape is not None:
+            light = np.concatenate([light, found.shape[:, 1:].reshape(len(light), -1)], 1)
+        record = replace(transfer.record.also(why), lamps=self.key, lamps_order=self.order,
+                         lamps_rays=rays * len(mesh.points), lamps_error=relative(found),
                          lamps_notice=" ".join(filter(None, (found.notice, self.notice))),
                          basis=transfer.record.basis + LAMPS_BASIS,
                          seconds=transfer.record.seconds + time.perf_counter() - began)
-        return replace(transfer, irradiance=found.values, record=record)
+        return replace(transfer, irradiance=light, record=record)
+
+    @property
+    def _bands(self) -> int:
+        """That are asked of the tracer and of the network."""
+        return self.order if self.order > 1 else 0
 
     def _predicted(self, mesh: TriangleMesh, seed: int, threads: int | None) -> Generator[float, None, Found]:
         """By the light-transport embedding; the paths are those of direct light. As good as it gets: the error is
@@ -79,14 +90,14 @@ class Lamps:
         """Make the room of the scene, if it is not there."""
         if self._room is None and len(self.scene.emitters):
             self._room = yield from embedding_bake.encoded(self.scene, seed=seed, threads=threads,
-                                                           occluders=self._occluders)
+                                                           occluders=self._occluders, directions=self.order > 1)
 
     def _asked(self, mesh: TriangleMesh, rows: NDArray, seed: int, threads: int | None
                ) -> Generator[float, None, Irradiance]:
         """What the network says at some points."""
         return (yield from embedding_bake.irradiance(
             self.scene, mesh.points[rows], mesh.normals[rows], seed=seed, threads=threads, occluders=self._occluders,
-            clearance=mesh.clearance[rows], room=self._room))
+            clearance=mesh.clearance[rows], room=self._room, order=self._bands))
 
     def _learned(self, mesh: TriangleMesh, paths: float, seed: int, threads: int | None
                  ) -> Generator[float, None, Found | None]:
@@ -126,7 +137,7 @@ class Lamps:
         for number in range(MOST):
             more = yield from scaled(irradiance(
                 self.scene, mesh.points, mesh.normals, rays, seed=_seed(seed, number), threads=threads,
-                occluders=self._occluders, clearance=mesh.clearance), start, share)
+                occluders=self._occluders, clearance=mesh.clearance, order=self._bands), start, share)
             found = more if found is None else _mean(found, done, more, rays)
             done, start = done + rays, start + share
             error = relative(found)
@@ -153,7 +164,9 @@ def relative(found: Irradiance) -> float:
 def _mean(first: Irradiance, rays: int, second: Irradiance, more: int) -> Irradiance:
     """Of two with these numbers of paths."""
     a, b = np.float32(rays / (rays + more)), np.float32(more / (rays + more))
-    return Irradiance(a * first.values + b * second.values, np.hypot(a * first.error, b * second.error), first.notice)
+    shape = None if first.shape is None or second.shape is None else a * first.shape + b * second.shape
+    return Irradiance(a * first.values + b * second.values, np.hypot(a * first.error, b * second.error), first.notice,
+                      shape)
 
 
 def _whole_batches(rays: float) -> int:

@@ -51,6 +51,7 @@ class BakeRecord:
     lamps_rays: int = 0               # paths that their irradiance is made of
     lamps_error: float | None = None  # rel L2 of the irradiance, measured
     lamps_notice: str = ""            # what a person should know of them
+    lamps_order: int = 1              # bands of their light by direction, for gloss; 1: irradiance alone
     basis: str = BASIS
     version: str = VERSION
     schema: int = SCHEMA
@@ -68,7 +69,7 @@ class BakeRecord:
     @property
     def numbers(self) -> int:
         """How many numbers each point has, irradiance included."""
-        return self.terms + (3 if self.lamps else 0)
+        return self.terms + (3 * self.lamps_order ** 2 if self.lamps else 0)
 
     def also(self, sentence: str) -> BakeRecord:
         """The same, with one sentence more (unless it is '') of why, if it was planned."""
@@ -100,7 +101,7 @@ class BakeRecord:
             raise UserError(_DAMAGED) from error
         if (frame.shape != (9,) or not np.allclose(frame.reshape(3, 3) @ frame.reshape(3, 3).T, np.eye(3), atol=1e-3)
                 or not 1 <= record.order <= MAX_ORDER or record.domain not in (POINT, CORNER, TEXEL)
-                or record.colours not in (1, 3)):
+                or record.colours not in (1, 3) or not 1 <= record.lamps_order <= MAX_ORDER):
             raise UserError(_DAMAGED)
         object.__setattr__(record, "frame", tuple(frame.tolist()))
         return record

@@ -55,7 +55,7 @@ class TextureTransfer:
     coefficients: list[NDArray[np.float32]]  # of each tile, (n, K); coloured ones (n, 3K), red, green, blue of each
     inside: list[NDArray[np.bool_]]          # of each tile, (n,) texels whose centre is on the mesh, not beside
     record: BakeRecord
-    irradiance: list[NDArray[np.float32]] | None = None  # of each tile, (n, 3) W/m^2 from lamps, if baked too
+    irradiance: list[NDArray[np.float32]] | None = None  # of each tile, (n, 3 or more) from lamps: see `lamps.Lamps`
 
     def fill_map(self) -> FillMap:
         """What the texels show that no face covers; see `texels.fill_map` and `texels.mirrored`."""
@@ -72,8 +72,8 @@ class TextureTransfer:
         After those of the coefficients comes the irradiance, where there is one.
         """
         tiles, first = self.coefficients, CHANNELS * index
-        if self.irradiance is not None and index == image_count(self.record.terms):
-            tiles, first = self.irradiance, 0
+        if self.irradiance is not None and index >= image_count(self.record.terms):
+            tiles, first = self.irradiance, CHANNELS * (index - image_count(self.record.terms))
         out = np.zeros((self.record.side ** 2, CHANNELS), np.float32)
         for texels, values in zip(self.texels, tiles, strict=True):
             part = values[:, first:first + CHANNELS]
@@ -160,7 +160,7 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
     terms = records[0].terms
     coefficients = [v[:, :terms] for v in values]
     irradiance = None if lamps is None else [v[:, terms:] for v in values]
-    record = _whole(records, map(_energy, coefficients), map(_energy, irradiance or ())).also(bands.reason)
+    record = _whole(records, map(_energy, coefficients), map(_lamps_energy, irradiance or ())).also(bands.reason)
     if tolerance is not None and records[0].tolerance is not None:
         record = replace(record, tolerance=tolerance, error_estimate=bands.whole(record.error_estimate))
     record = replace(record, seed=seed, seconds=time.perf_counter() - began, target="texture", side=side,
@@ -203,7 +203,7 @@ def merged(transfers: Sequence[TextureTransfer]) -> TextureTransfer:
             for keep in [(owner[texels] == number) | (owner[texels] < 0)]]
     lit = first.irradiance is not None
     record = _whole([t.record for t in transfers], [sum(map(_energy, t.coefficients)) for t in transfers],
-                    [sum(map(_energy, t.irradiance or ())) for t in transfers])
+                    [sum(map(_lamps_energy, t.irradiance or ())) for t in transfers])
     record = replace(record, seconds=sum(t.record.seconds for t in transfers), fingerprint="", uv_map="",
                      single_faces=sum(t.record.single_faces for t in transfers), frame=IDENTITY,
                      bounces=max(t.record.bounces for t in transfers))
@@ -218,6 +218,11 @@ def _tile_seed(seed: int, number: int) -> int:
 def _energy(values: NDArray) -> float:
     """Sum of squares."""
     return float(np.square(values, dtype=np.float64).sum())
+
+
+def _lamps_energy(values: NDArray) -> float:
+    """Likewise, of irradiance, whatever else there is of the lamps."""
+    return _energy(values[:, :3])
 
 
 def _whole(records: Sequence[BakeRecord], energies: Iterable[float], lamps: Iterable[float]) -> BakeRecord:

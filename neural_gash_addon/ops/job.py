@@ -170,7 +170,8 @@ def _key(settings: NeuralGashSettings, shape: str, matrix: NDArray, maps: Sequen
               ("method", "order", "quality", "rays", "tolerance", "sizing", "side", "texels_per_metre", "padding",
                "bounces", "share", "gloss")}
     return json.dumps({"version": VERSION, "shape": shape, "place": digest.hexdigest(),
-                       "lamps": "" if lamps is None else f"{lamps.key} {lamps.learned}", **chosen}, sort_keys=True)
+                       "lamps": "" if lamps is None else f"{lamps.key} {lamps.learned} {lamps.order}",
+                       **chosen}, sort_keys=True)
 
 
 def check(context: bpy.types.Context, job: Job) -> bpy.types.Object:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..backend.lamps import Lamps
-from ..properties import CHEAPEST, NETWORK, PATHS, NeuralGashSettings
+from ..properties import CHEAPEST, NETWORK, PATHS, TEXTURE, NeuralGashSettings
 from ..scene.lamps import LitScenes
 
 _LEARNED = {CHEAPEST: None, PATHS: False, NETWORK: True}
@@ -16,7 +16,8 @@ class LampReader:
 
     def __init__(self, depsgraph: bpy.types.Depsgraph, settings: NeuralGashSettings) -> None:
         self._how = {**(settings.tracing() or {"tolerance": settings.tolerance}),
-                     "learned": _LEARNED[settings.lamps_by]}
+                     "learned": _LEARNED[settings.lamps_by],
+                     "order": settings.order if settings.gloss and settings.target == TEXTURE else 1}
         self._scenes = LitScenes(depsgraph)
         self._known: dict[str, Lamps] = {}
 

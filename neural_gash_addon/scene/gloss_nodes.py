@@ -19,7 +19,7 @@ from ..backend import lobes
 from ..backend import spherical_harmonics as sh
 from ..backend.texture import CHANNELS
 
-_GLOSS, _VERSION = "neural_gash_gloss", 1   # custom property of the group: its version
+_GLOSS, _VERSION = "neural_gash_gloss", 2   # custom property of the group: its version
 _LOBES = "neural_gash_lobes"                # custom property of the image of attenuation by roughness: its lobe
 _LOBE_STEPS = 1024
 SPECULAR = 0.04                             # reflectance of a plain dielectric, facing
@@ -53,15 +53,18 @@ def build_gloss_group(order: int, images: Sequence[bpy.types.Image], uv_map: str
                       ) -> bpy.types.NodeTree:
     """A new group for one bake.
 
-    Inputs: Albedo and Specular (colours), Roughness, and Turn X, Y, Z: rows of the turn into the
-    frame of the bake. Output Shader, an emission.
+    Inputs: Albedo and Specular (colours), Roughness, Turn X, Y, Z: rows of the turn into the
+    frame of the bake, and Lamps and Glow, as `nodes.ensure_group` has them. Output Shader, an emission.
     """
     group = bpy.data.node_groups.new(f"PRT Gloss {order}", "ShaderNodeTree")
     group[_GLOSS] = _VERSION
     interface = group.interface
     for name, kind in (("Albedo", "Color"), ("Specular", "Color"), ("Roughness", "Float"),
-                       ("Turn X", "Vector"), ("Turn Y", "Vector"), ("Turn Z", "Vector")):
-        interface.new_socket(name, in_out="INPUT", socket_type=f"NodeSocket{kind}")
+                       ("Turn X", "Vector"), ("Turn Y", "Vector"), ("Turn Z", "Vector"), ("Lamps", "Float"),
+                       ("Glow", "Color")):
+        socket = interface.new_socket(name, in_out="INPUT", socket_type=f"NodeSocket{kind}")
+        if name == "Glow":
+            socket.default_value = (0, 0, 0, 1)
     interface.new_socket("Shader", in_out="OUTPUT", socket_type="NodeSocketShader")
     graph = _Graph(group)
     inputs = graph.node("NodeGroupInput").outputs
@@ -75,7 +78,8 @@ def build_gloss_group(order: int, images: Sequence[bpy.types.Image], uv_map: str
     glossy = graph.vector("MULTIPLY", total, inputs["Specular"])
     diffuse = graph.vector("MULTIPLY", graph.join(numbers[:3]), inputs["Albedo"])
     emission = graph.node("ShaderNodeEmission")
-    group.links.new(graph.vector("ADD", glossy, diffuse), emission.inputs["Color"])
+    reflected = graph.vector("ADD", glossy, diffuse)
+    group.links.new(graph.vector("MULTIPLY_ADD", inputs["Glow"], inputs["Lamps"], reflected), emission.inputs["Color"])
     group.links.new(emission.outputs[0], graph.node("NodeGroupOutput").inputs["Shader"])
     return group
 

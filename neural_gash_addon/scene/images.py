@@ -25,11 +25,11 @@ RECORD = "neural_gash"         # custom property of an image: the record of the 
 
 def make_images(name: str, transfer: TextureTransfer, folder: Path | None, half: bool, parts: str = "",
                 label: str = "prt", owners: Sequence[bpy.types.Mesh] = ()) -> list[bpy.types.Image]:
-    """New images that hold a texture bake, four coefficients each, and one of the irradiance, if there is one.
+    """New images that hold a texture bake, four coefficients each, and those of the lamps, if there are any.
 
     Args:
         folder: where the files go; they are packed into the .blend where not given.
-        half: 16 bits a channel instead of 32; not for irradiance, which may be of any size.
+        half: 16 bits a channel instead of 32; not for lamps, whose light may be of any size.
         parts: what the record does not say of each object that shares the texture, as JSON.
         label: what the files are called after the object.
         owners: the meshes that the images are for, whose earlier files are replaced.
@@ -49,8 +49,9 @@ def make_images(name: str, transfer: TextureTransfer, folder: Path | None, half:
 
 
 def _names(record: BakeRecord) -> list[str]:
-    """What tells the images of a bake apart: numbers, then that of the irradiance, where it has one."""
-    return [*map(str, range(image_count(record.terms))), *(["lamps"] if record.lamps else [])]
+    """What tells the images of a bake apart: numbers, then those of the lamps, whose first has the irradiance."""
+    lamps = image_count(3 * record.lamps_order ** 2) if record.lamps else 0
+    return [*map(str, range(image_count(record.terms))), *["lamps", *(f"lamps{n}" for n in range(1, lamps))][:lamps]]
 
 
 def attach(data: bpy.types.Mesh, images: Sequence[bpy.types.Image], key: str = TRANSFER) -> None:
@@ -135,7 +136,7 @@ def _paths(folder: Path, stem: str, record: BakeRecord) -> list[Path]:
 
 
 def _is_lamps(path: Path) -> bool:
-    return path.stem.endswith("_lamps")
+    return re.search(r"_lamps\d*$", path.stem) is not None
 
 
 def _write(stem: str, transfer: TextureTransfer, folder: Path, half: bool, parts: str) -> list[Path]:

@@ -31,8 +31,8 @@ def ensure_group(order: int, colours: int = 1, images: Sequence[bpy.types.Image]
     Args:
         colours: 3 where each coefficient has a red, a green and a blue.
         images, uv_map: where the coefficients of a texture bake are; such a group is of that bake alone.
-        lamps: it adds the irradiance of the bake, whose image is the last one. Then there are inputs Lamps, a factor on
-            their light, and Glow, radiance that the surface emits by itself, which the factor is on, too.
+        lamps: it adds the irradiance of the bake, whose image is the last of `images`. Then there are inputs Lamps, a
+            factor on their light, and Glow, radiance that the surface emits by itself, which the factor is on, too.
     """
     place = [image.session_uid for image in images]
     for group in bpy.data.node_groups:

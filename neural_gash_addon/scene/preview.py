@@ -15,6 +15,7 @@ from ..backend import spherical_harmonics as sh
 from ..backend.errors import UserError
 from ..backend.geometry import TEXEL
 from ..backend.record import BakeRecord
+from ..backend.texture import image_count
 from .attributes import attribute_names, check_whole, has_bake, read_record
 from .emission import emits_alone, emitters, set_glow
 from .frames import bake_frame, world_matrix
@@ -59,8 +60,8 @@ def preview_on(obj: bpy.types.Object, lobe: str = "") -> None:
     if lobe and can_gloss(record):
         group = gloss_group(obj.data, record, lobe)
     else:
-        group = ensure_group(record.order, record.colours, images, record.uv_map if images else "",
-                             bool(record.lamps))
+        dull = images[:image_count(record.terms) + bool(record.lamps)]
+        group = ensure_group(record.order, record.colours, dull, record.uv_map if images else "", bool(record.lamps))
     originals = [slot.material for slot in obj.material_slots] or [None]
     previews: list[bpy.types.Material] = []
     try:
@@ -142,7 +143,7 @@ def update_light(obj: bpy.types.Object, light: NDArray, tint: float = 1.0, lamps
             slot.material = slot.material.copy()  # a duplicated object, which may be turned differently
     for node in _group_nodes(obj):
         if is_gloss(node.node_tree):
-            light_gloss(obj.data, record, node, seen, turn)
+            light_gloss(obj.data, record, node, seen, turn, lamps)
         else:
             set_light(node, seen, tint, lamps)
 

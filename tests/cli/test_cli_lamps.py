@@ -96,6 +96,9 @@ def test_a_second_farm_run_is_up_to_date_until_a_lamp_changes(lit, run, tmp_path
         "baked", "up to date", "baked", "baked"]
 
 
-def test_gloss_and_lamps_do_not_go_together(lit, refused, tmp_path):
-    said = refused("bake", lit, "--lamps", "--texture", 16, "--gloss", "ggx", "--out", tmp_path / "a.blend")
-    assert "--lamps" in said
+def test_gloss_shows_lamps_if_it_is_asked_for_when_they_are_baked(lit, run, refused, tmp_path):
+    for name, more in (("dull", ()), ("glossy", ("--gloss", "ggx"))):
+        run("bake", lit, "--lamps", "--texture", 16, "--rays", 32, *more, "--out", tmp_path / f"{name}.blend")
+    said = refused("relight", tmp_path / "dull.blend", "--gloss", "ggx", "--png", tmp_path / "a.png")
+    assert "baked with --gloss" in said
+    run("relight", tmp_path / "glossy.blend", "--gloss", "ggx", "--png", tmp_path / "a.png")

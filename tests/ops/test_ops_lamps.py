@@ -297,11 +297,13 @@ def test_with_bounces_too(floor, settings):
     assert picture([floor])[30, 48].min() > 0
 
 
-def test_gloss_is_shown_dull(floor, settings):
+def test_a_bake_that_does_not_know_where_light_comes_from_is_shown_dull(floor, settings):
     from neural_gash_addon.scene.preview import is_glossy, is_on
     area()
-    settings.target, settings.side, settings.gloss = "TEXTURE", 32, True
+    settings.target, settings.side = "TEXTURE", 32
     bake()
+    assert record(floor).lamps_order == 1
+    settings.gloss = True
     assert is_on(floor) and not is_glossy(floor)
 
 
