@@ -13,13 +13,13 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
-import trials_rooms
 import trials_scene
 import trials_surface
 from chart_measure import about
@@ -234,16 +234,23 @@ def main() -> int:
     if not arguments.only and (missing := _missing(results["noise"].get("rows", []), chosen)):
         results["noise"] = _with(results["noise"], "rows", noise(scale, missing))
         _save(arguments.out, results)
-    if not arguments.only and not results.get("rooms"):
-        results["rooms"] = {**about(), "rows": trials_rooms.tried(8 if arguments.quick else 1)}
-        _save(arguments.out, results)
-    parts = [part for part in (*results["trials"].values(), results["noise"], results.get("rooms")) if part]
+    rooms = ""
+    if find_spec("torch"):
+        import trials_rooms  # needs it
+
+        if not arguments.only and not results.get("rooms"):
+            found = trials_rooms.tried(8 if arguments.quick else 1)
+            results["rooms"] = {**about(), "rows": found}
+            _save(arguments.out, results)
+        rooms = trials_rooms.table(results.get("rooms", {}).get("rows", []))
+    every = (*results["trials"].values(), results["noise"], results.get("rooms", {}))
+    parts = [part for part in every if "commit" in part]
     machines = "; ".join(sorted({part["machine"] for part in parts}))
     commits = ", ".join(sorted({commit for part in parts for commit in part["commit"].split(", ")}))
     cells = [Cell(**cell) for _, trial in trials for cell in results["trials"][trial.__name__]["cells"]]
     texts = {"origin": f"Machine: {machines}. Commit: {commits}. Seed 0; {REFERENCE_SEED} of the references.",
              "table": table(cells), "noise": noise_table(results["noise"].get("rows", [])), "red": red_list(cells),
-             "rooms": trials_rooms.table(results.get("rooms", {}).get("rows", []))}
+             "rooms": rooms}
     if arguments.page:
         fill(arguments.page, texts)
     print("\n\n".join(texts.values()))

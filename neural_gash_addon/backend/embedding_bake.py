@@ -73,7 +73,7 @@ def encoded(scene: LitScene, *, seed: int = 0, threads: int | None = None, occlu
     Raises:
         UserError: no torch or weights, or a room larger than the network knows.
     """
-    refuse_larger(scene.positions[scene.triangles])
+    refuse_larger(scene.corners[:len(scene.corners) - scene.bodiless])
     model = network()
     decoder = radiance_network(model) if directions else None
     lit = yield from lit_points(scene, occluders or scene.occluders(), seed=seed, threads=threads,
@@ -139,10 +139,11 @@ def irradiance(scene: LitScene, points: NDArray, normals: NDArray, *, seed: int 
 
 def _share_off(found: NDArray, truth: Irradiance) -> float:
     """Relative error of values (n, 3) by a noisy truth: what its noise does not explain, and a standard error more."""
+    found, values, noise = (np.asarray(each, np.float64) for each in (found, truth.values, truth.error))
     energy = float(np.square(found).sum())
     if not energy or not len(found):
         return 0.0
-    beyond = (np.square(found - truth.values) - np.square(truth.error)).sum(1)
+    beyond = (np.square(found - values) - np.square(noise)).sum(1)
     return float(max(beyond.sum(), 0.0) + len(beyond) ** 0.5 * beyond.std()) ** 0.5 / energy ** 0.5
 
 

@@ -2,6 +2,7 @@
 """What lamps add to a bake: irradiance at its points, to the same tolerance, by paths or by the embedding's network."""
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Generator
@@ -32,6 +33,7 @@ _BEST = 0.04    # relative error below which it has been in no room
 _TRIAL = 512    # points at which it is tried
 
 
+_LOGGER = logging.getLogger(__name__)
 Found = tuple[Irradiance, int, str]  # with its paths from each point, and a sentence of why
 
 
@@ -64,7 +66,8 @@ class Lamps:
         light = found.values
         if found.shape is not None:
             light = np.concatenate([light, found.shape[:, 1:].reshape(len(light), -1)], 1)
-        record = replace(transfer.record.also(why), lamps=self.key, lamps_order=self.order,
+        plan = f"{transfer.record.plan} {why}".strip()
+        record = replace(transfer.record, plan=plan, lamps=self.key, lamps_order=self.order,
                          lamps_rays=rays * len(mesh.points), lamps_error=relative(found),
                          lamps_notice=" ".join(filter(None, (found.notice, self.notice))),
                          basis=transfer.record.basis + LAMPS_BASIS,
@@ -80,16 +83,16 @@ class Lamps:
         """By the light-transport embedding; the paths are those of direct light. As good as it gets: the error is
         measured, and not brought to a tolerance.
         """
-        yield from scaled(self._encode(seed, threads), 0.0, 0.4)
+        yield from scaled(self._encode(threads), 0.0, 0.4)
         found = yield from scaled(self._asked(mesh, np.arange(len(mesh.points)), seed, threads), 0.4, 0.6)
-        if self.tolerance is not None and relative(found) > self.tolerance:
+        if self.tolerance is not None and not relative(found) <= self.tolerance:
             found = replace(found, notice="The network's error is above the tolerance; by paths it would be met.")
         return found, embedding_bake.STRAIGHT, ""
 
-    def _encode(self, seed: int, threads: int | None) -> Generator[float, None, None]:
-        """Make the room of the scene, if it is not there."""
+    def _encode(self, threads: int | None) -> Generator[float, None, None]:
+        """Make the room of the scene, if it is not there: the same whichever mesh or tile is the first to ask."""
         if self._room is None and len(self.scene.emitters):
-            self._room = yield from embedding_bake.encoded(self.scene, seed=seed, threads=threads,
+            self._room = yield from embedding_bake.encoded(self.scene, threads=threads,
                                                            occluders=self._occluders, directions=self.order > 1)
 
     def _asked(self, mesh: TriangleMesh, rows: NDArray, seed: int, threads: int | None
@@ -106,14 +109,17 @@ class Lamps:
         facing = np.flatnonzero(mesh.normals.any(1))
         rows = np.random.default_rng([seed, 12]).permutation(facing)[:_TRIAL]
         try:
-            yield from scaled(self._encode(seed, threads), 0.0, 0.4)
+            yield from scaled(self._encode(threads), 0.0, 0.4)
             tried = yield from scaled(self._asked(mesh, rows, seed, threads), 0.4, 0.1)
+            if not relative(tried) <= self.tolerance:
+                return None
+            found = yield from scaled(self._asked(mesh, np.arange(len(mesh.points)), seed, threads), 0.5, 0.5)
         except UserError:  # no torch, or a larger room than it knows: paths need neither
             return None
-        if relative(tried) > self.tolerance:
+        except (RuntimeError, AttributeError, ImportError):  # a torch that is broken, or its GPU full: nor that
+            _LOGGER.warning("PyTorch failed, so paths find the light of lamps.", exc_info=True)
             return None
-        found = yield from scaled(self._asked(mesh, np.arange(len(mesh.points)), seed, threads), 0.5, 0.5)
-        if relative(found) > self.tolerance:
+        if not relative(found) <= self.tolerance:
             return None
         return found, embedding_bake.STRAIGHT, (f"Lamps by the network, which is {100 * relative(found):.2g} % off: "
                                                 f"quicker than {paths:.0f} paths a point.")
@@ -121,8 +127,8 @@ class Lamps:
     def _worth(self, paths: float, points: int) -> bool:
         """Whether to try the network, if so many paths from each of so many points are still missing."""
         assert self.tolerance is not None
-        cost = _ROOM * (self._room is None) + _POINT * points
-        return self.tolerance >= _BEST and paths * points > _WORTH * cost
+        # the room counts even where it is there: what a tile is baked by shall not hang on those before it
+        return self.tolerance >= _BEST and points > _TRIAL and paths * points > _WORTH * (_ROOM + _POINT * points)
 
     def _traced(self, mesh: TriangleMesh, seed: int, threads: int | None) -> Generator[float, None, Found]:
         """By paths.

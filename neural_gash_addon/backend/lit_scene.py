@@ -36,7 +36,9 @@ class LitScene:
             raise UserError(NO_FACES)
         if not np.isfinite(self.positions).all():
             raise UserError(NOT_FINITE)
-        if not (np.isfinite(self.emission).all() and np.min(self.emission) >= 0):
+        with np.errstate(over="ignore"):
+            sends = np.asarray(self.emission, np.float32)  # as it is traced
+        if not (np.isfinite(sends).all() and np.min(sends) >= 0):
             raise UserError("The scene has emission that is negative, infinite or not a number.")
         if not (np.isfinite(self.albedo).all() and np.min(self.albedo) >= 0 and np.max(self.albedo) <= 1):
             raise UserError("The scene has colours that are not between 0 and 1.")

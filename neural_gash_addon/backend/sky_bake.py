@@ -78,7 +78,8 @@ def on_surface(mesh: TriangleMesh, count: int, seed: int) -> TriangleMesh:
         candidates = here[:, 0] + u[:, None] * (here[:, 1] - here[:, 0]) + v[:, None] * (here[:, 2] - here[:, 0])
         facing = double[faces] / sizes[faces, None]
         spacing = float(np.sqrt(sizes.sum() / 2 / count))
-        kept = farthest(np.concatenate([candidates, TURN * spacing * facing], 1), count)
+        scale = 1 / float(np.ptp(candidates, axis=0).max() or 1.0)  # what is compared are squares
+        kept = farthest(scale * np.concatenate([candidates, TURN * spacing * facing], 1), count)
         places, normals = candidates[kept], facing[kept]
     return TriangleMesh(mesh.positions, mesh.triangles, places, normals, normals,
                         np.arange(len(places), dtype=np.int32), TEXEL, mesh.resolution)
@@ -133,7 +134,7 @@ class Sky:
 
         from .networks.embedding import Frame
 
-        self.occluders, self.rays = occluders, points.rays * len(points.places)
+        self.occluders, self._rays = occluders, points.rays * len(points.places)
         self._model, self._device = model.to(device), device
         sizes = model.settings
         layout = embedding.layout(points.places, sizes.gathered, sizes.around)
@@ -143,6 +144,11 @@ class Sky:
         with torch.no_grad():
             self._codes = model.encoder(self._frame, self._tensor(points.blocked),
                                         torch.from_numpy(parents).to(device))
+
+    def spent(self) -> int:
+        """Rays that the scene points took, the first time that it is asked: several bakes may share them."""
+        rays, self._rays = self._rays, 0
+        return rays
 
     def blocked(self, points: NDArray, normals: NDArray, order: int) -> NDArray[np.float32]:
         """Blocked part (n, K) at points (n, 3) with unit normals."""
@@ -205,11 +211,10 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        sky, used = scene, 0  # whose rays count once, where several bakes share it
+        sky = scene
         if sky is None:
             built = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
             sky = yield from scaled(_encode(built, mesh, seed, threads), 0.0, _ENCODING)
-            used = sky.rays if sky is not None else 0
         coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
         lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
         lit = lit[morton_order(mesh.points[lit])] if len(lit) else lit
@@ -225,7 +230,8 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     finally:
         torch.set_num_threads(before)
     return Transfer(coefficients, BakeRecord(
-        method="embedding", order=order, points=len(mesh.points), domain=mesh.domain, rays=used,
+        method="embedding", order=order, points=len(mesh.points), domain=mesh.domain,
+        rays=sky.spent() if sky is not None else 0,
         probe_rays=2 * CHECKS * len(checked) if sky is not None else 0, seed=seed, seconds=time.perf_counter() - began,
         error_estimate=error))
 

@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("torch")
 
 from neural_gash_addon.backend import embedding_bake, lamps, methods
+from neural_gash_addon.backend.errors import UserError
 from neural_gash_addon.backend.geometry import TriangleMesh
 from neural_gash_addon.backend.irradiance import irradiance
 from neural_gash_addon.backend.lamps import Lamps
@@ -41,6 +42,7 @@ def encodings(monkeypatch):
     calls, real = [], embedding_bake.encoded
     monkeypatch.setattr(embedding_bake, "encoded", lambda *a, **k: calls.append(1) or real(*a, **k))
     monkeypatch.setattr(lamps, "_ROOM", 0)
+    monkeypatch.setattr(lamps, "_TRIAL", 256)
     return calls
 
 
@@ -77,3 +79,35 @@ def test_else_paths_are_taken(room, floor, encodings, monkeypatch):
     assert baked(large, floor, tolerance=0.08, learned=None).record.lamps_rays > 128 * len(floor.points)
     monkeypatch.setitem(sys.modules, "torch", None)
     assert baked(room, floor, tolerance=0.08, learned=None).record.lamps_rays == paths.record.lamps_rays
+
+
+def test_a_torch_that_is_broken_is_told_of_and_paths_take_over(room, floor, encodings, monkeypatch, caplog):
+    paths = baked(room, floor, tolerance=0.08, learned=False)
+
+    def broken():
+        raise RuntimeError("Numpy is not available")
+
+    monkeypatch.setattr(embedding_bake, "network", broken)
+    found = baked(room, floor, tolerance=0.08, learned=None)
+    assert found.record.lamps_rays == paths.record.lamps_rays and "PyTorch failed" in caplog.text
+
+
+def test_an_error_that_is_no_number_is_not_within_the_tolerance(room, floor, encodings, monkeypatch):
+    monkeypatch.setattr(embedding_bake, "_share_off", lambda *_: float("nan"))
+    assert baked(room, floor, tolerance=0.08, learned=None).record.lamps_error <= 0.08
+    assert "above the tolerance" in baked(room, floor, tolerance=0.08, learned=True).record.lamps_notice
+
+
+def test_what_a_tile_is_baked_by_does_not_hang_on_those_before_it(room, floor, encodings):
+    again = Lamps(room, "key", tolerance=0.08, learned=None)
+    first, second = (methods.run(methods.bake(floor, "analytic", 3, threads=1, lamps=again, seed=seed)).irradiance
+                     for seed in (1, 2))
+    alone = methods.run(methods.bake(floor, "analytic", 3, threads=1, seed=2,
+                                     lamps=Lamps(room, "key", tolerance=0.08, learned=None)))
+    np.testing.assert_array_equal(alone.irradiance, second)
+    assert not np.array_equal(first, second) and "network" in alone.record.plan
+
+
+def test_lamps_that_no_float_holds_are_refused(room):
+    with pytest.raises(UserError, match="infinite"):
+        LitScene(room.positions, room.triangles, room.albedo, 1e30 * (1e9 * room.emission))

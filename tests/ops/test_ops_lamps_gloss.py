@@ -17,8 +17,8 @@ def floor(make, settings):
     obj = make(*FLOOR, name="Floor")
     bpy.context.scene.world = bpy.data.worlds.new("Dark")
     bpy.context.scene.world.color = (0, 0, 0)
-    settings.method, settings.target, settings.side, settings.gloss, settings.lamps = "analytic", "TEXTURE", 64, True, True
-    settings.lamps_by = "PATHS"
+    settings.method, settings.target, settings.side = "analytic", "TEXTURE", 64
+    settings.gloss, settings.lamps, settings.lamps_by = True, True, "PATHS"
     return obj
 
 
