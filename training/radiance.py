@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from neural_gash_addon.backend import embedding_bake, weights
+from neural_gash_addon.backend import embedding_bake, lobes, weights
 from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.networks.embedding import Codes, Frame, level
 from neural_gash_addon.backend.networks.radiance import ORDER, Radiance
@@ -29,6 +29,7 @@ from .room_labels import VALIDATION_RAYS
 NAME = "radiance"
 STEPS, RATE, EVERY = 1_800, 2e-3, 100
 BANDS = range(1, ORDER)
+ROUGHNESS = 0.4, 0.6
 PATHS = 64  # as many as a scene point has
 
 
@@ -92,24 +93,34 @@ def room(path: Path) -> Room:
     return Room(path)
 
 
-def by_band(found: NDArray, held: Room) -> NDArray:
-    """(ORDER,) squared error over squared truth of light by direction (n, K, 3) at `held_rows`.
+def sums(found: NDArray | None, held: Room) -> tuple[NDArray, NDArray]:
+    """(ORDER,) squared error and squared truth of light by direction (n, K, 3) at `held_rows`, by band.
 
-    Without what the truth's own noise is expected to add.
+    Without what the truth's own noise is expected to add. None: of PATHS paths at the queries, whose squared error is
+    the variance of the truth, of so many fewer paths.
     """
     rows = held_rows(held.sample)
-    error, energy = (np.add.reduceat(np.square(each).sum(2).sum(0, dtype=np.float64), np.arange(ORDER) ** 2)
-                     for each in (found - held.truth[rows], held.truth[rows]))
     noise = np.square(held.noise[rows]).sum((0, 2), dtype=np.float64)
-    return (error - noise) / (energy - noise)
+    energy = _bands(held.truth[rows]) - noise
+    return noise * VALIDATION_RAYS / PATHS if found is None else _bands(found - held.truth[rows]) - noise, energy
 
 
-def paths_at_query(held: Room) -> NDArray:
-    """(ORDER,) `by_band` of PATHS paths at the queries: the variance of the truth, of so many fewer paths."""
-    rows = held_rows(held.sample)
-    noise = np.square(held.noise[rows]).sum((0, 2), dtype=np.float64)
-    energy = np.add.reduceat(np.square(held.truth[rows]).sum((0, 2), dtype=np.float64), np.arange(ORDER) ** 2)
-    return noise * VALIDATION_RAYS / PATHS / (energy - noise)
+def _bands(shape: NDArray) -> NDArray:
+    """(ORDER,) sums of squares of (n, K, 3)."""
+    return np.add.reduceat(np.square(shape).sum((0, 2), dtype=np.float64), np.arange(ORDER) ** 2)
+
+
+def by_band(found: NDArray | None, held: Room) -> NDArray:
+    """(ORDER,) squared error over squared truth, see `sums`."""
+    error, energy = sums(found, held)
+    return error / energy
+
+
+def in_lobe(found: NDArray | None, held: Room, roughness: float) -> float:
+    """The same of what a GGX lobe reflects, over all directions."""
+    damped = lobes.ggx_attenuation(roughness, ORDER) ** 2
+    error, energy = sums(found, held)
+    return float(damped @ error / (damped @ energy))
 
 
 def network(model: nn.Module, held: Room) -> NDArray:
@@ -141,11 +152,15 @@ def table(model: nn.Module, held: list[Room]) -> str:
         "irradiance of the embedding, even": lobe,
         **{f"mean of the {count} nearest scene points": lambda each, count=count: near_mean(each, count)  # type: ignore
            for count in (16, 64)}, f"{PATHS} paths at the query": None}
-    lines = [f"{'median of the rooms, in brackets the mean':42}" + "".join(f"{f'band {b}':>16}" for b in range(ORDER))]
+    lines = [f"{'median of the rooms, in brackets the mean':42}" + "".join(f"{f'band {b}':>16}" for b in range(ORDER))
+             + "".join(f"{f'roughness {r}':>16}" for r in ROUGHNESS)]
     for name, give in ways.items():
-        found = np.array([paths_at_query(each) if give is None else by_band(give(each), each) for each in held])
+        found = []
+        for each in held:
+            given = None if give is None else give(each)
+            found.append([*by_band(given, each), *(in_lobe(given, each, roughness) for roughness in ROUGHNESS)])
         lines.append(f"{name:42}" + "".join(f"{median:8.3f} ({mean:.3f})" for median, mean in
-                                            zip(np.median(found, 0), found.mean(0), strict=True)))
+                                            zip(np.median(found, 0), np.mean(found, 0), strict=True)))
     return "\n".join(lines)
 
 

@@ -82,14 +82,16 @@ def test_errors_are_over_those_of_darkness_and_without_noise(cache, tiny):
     truth = held.truth[radiance.held_rows(held.sample)]
     np.testing.assert_allclose(radiance.by_band(truth, held), 0, atol=1e-12)
     np.testing.assert_allclose(radiance.by_band(1.5 * truth, held), 0.25, rtol=1e-4)
+    assert radiance.in_lobe(1.5 * truth, held, 0.4) == pytest.approx(0.25, rel=1e-4)
     found = truth.copy()
     found[:, sh.band_slice(2)] = 0
     np.testing.assert_allclose(radiance.by_band(found, held), [0, 0, 1, 0, 0], atol=1e-6)
+    assert radiance.in_lobe(found, held, 0.95) < radiance.in_lobe(found, held, 0.2)
     energy = np.square(truth[:, sh.band_slice(4)]).sum()
     held.noise = held.noise.copy()
     held.noise[:, 4] = np.sqrt(0.2 * energy / truth[:, 0].size)
     assert radiance.by_band(1.5 * truth, held)[4] == pytest.approx((0.25 - 0.2) / 0.8, rel=1e-3)
-    assert radiance.paths_at_query(held)[4] == pytest.approx(0.2 * 2048 / 64 / 0.8, rel=1e-3)
+    assert radiance.by_band(None, held)[4] == pytest.approx(0.2 * 2048 / 64 / 0.8, rel=1e-3)
 
 
 def test_the_table_has_a_row_of_each(cache, tiny):
