@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from . import spherical_harmonics as sh
 from .estimator import MAX_RAYS, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
-from .hybrid import SIZE, Network, curves, filtered, placed
+from .hybrid import SIZE, Network, filtered, placed, second_curve
 from .pilot import Pilot, pilot_rays, sample_size
 from .progress import run, scaled
 from .raycast import Geometry, Occluders
@@ -130,16 +130,16 @@ class _Work:
             self.lit = lit[morton_order(mesh.points[lit])] if count else lit
         else:
             places, normals = placed(mesh.points[lit], mesh.normals[lit])
-            first, second = curves(places)
+            first = morton_order(places)
             self.lit, self._placed = lit[first], (places[first], normals[first])
-            self._curves = [np.arange(count), np.argsort(first)[second]]
-        self.unshadowed = np.empty((count, sh.coefficient_count(order)), np.float32)  # (n, K)
+            self._second = pool.submit(second_curve, self._placed[0])  # beside the rest, which waits for rays
+        self.unshadowed = np.empty((count, sh.coefficient_count(order)), np.float32)  # (n, K), `filled`
 
         def fill(start: int) -> None:
             rows = slice(start, start + _ROWS)
             self.unshadowed[rows] = sh.cosine_lobe(mesh.normals[self.lit[rows]], order)
 
-        list(pool.map(fill, range(0, count, _ROWS)))
+        self._filled = pool.map(fill, range(0, count, _ROWS))
         self._sums = np.zeros(self.unshadowed.shape)
         # without the network, as much as a bake by rays alone traces anew to measure its error, or less
         most, times = (count, _SAMPLE_TIMES) if network else (-(-count // 2), 1)
@@ -156,10 +156,12 @@ class _Work:
             (n, K) as it was traced, and as the network has it, if there is one.
         """
         yield from self._estimator.trace(self._pool, self._threads, self.lit, start, stop, self._sums)
-        traced = self._estimator.turned(self._pool, self.lit, self._estimator.means(self.lit, self._sums, 0, stop))
+        list(self._filled)
+        traced = self._estimator.blocked(self._pool, self.lit, self._sums, stop)
         if self._network is None:
             return traced, traced
-        return traced, filtered(*self._placed, self._curves, traced, self.unshadowed, stop, self._network, self._pool)
+        orders = np.arange(len(self.lit)), self._second.result()
+        return traced, filtered(*self._placed, orders, traced, self.unshadowed, stop, self._network, self._pool)
 
     def sample(self) -> tuple[NDArray, NDArray, NDArray]:
         """Some of the points (s,), and two independent traces (s, K) of their blocked part; on the calling thread."""
