@@ -143,6 +143,27 @@ def filtered(places: NDArray, normals: NDArray, orders: Sequence[NDArray], block
     return now[:-1]
 
 
+def between(some: NDArray[np.float32], unshadowed: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The blocked part of all points (n, K) along a curve, from that of the first, the third and so on.
+
+    The others take the mean of the two beside them, as `filtered` passes on what is blocked.
+
+    Args:
+        some: (ceil(n / 2), K). unshadowed: (n, K).
+    """
+    even = unshadowed[:, 1:] / np.float32(FULL)
+    values = some.copy()
+    values[:, 1:] -= values[:, :1] * even[::2]
+    out = np.empty(unshadowed.shape, np.float32)
+    out[::2] = some
+    gaps = out[1::2]
+    gaps[:] = values[:len(gaps)]
+    gaps[:len(values) - 1] += values[1:]
+    gaps[:len(values) - 1] *= np.float32(0.5)
+    gaps[:, 1:] += gaps[:, :1] * even[1::2]
+    return out
+
+
 def blocks(order: NDArray) -> NDArray[np.int64]:
     """(b, SIZE) of an order (N,), cut into as many as that takes; the last reaches back until it is whole too.
 
