@@ -36,8 +36,9 @@ def bare_seconds(mesh: TriangleMesh, scene: Occluders, rays: int, threads: int) 
             arrays = []
             for rows, (lift, harmonics) in batch:
                 chosen = points[rows]
-                frames = estimator._frames(chosen).reshape(-1, 9).astype(np.float32)
-                arrays.append((np.repeat(estimator._origins[chosen], len(harmonics), axis=0),
+                frames = np.ascontiguousarray(estimator._frames(chosen), np.float32).reshape(-1, 9)
+                origins = scene.origins(mesh.points[chosen], mesh.clearance[chosen])
+                arrays.append((np.repeat(origins, len(harmonics), axis=0),
                                (frames @ lift).reshape(-1, 3)))
                 traced += len(arrays[-1][0])
             spent += seconds(lambda held=arrays: list(pool.map(lambda ray: scene.blocked(*ray), held)))

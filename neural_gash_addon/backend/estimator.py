@@ -47,7 +47,7 @@ class BlockedEstimator:
         self._order = order
         self._count, self._most, self._scramble = sets, rays, int(rng.integers(2**31))
         self._made = np.zeros((sets, 0, 3))  # directions so far: most bakes stop long before the most rays
-        self._origins = occluders.origins(mesh.points, mesh.clearance)
+        self._points, self._clearance = mesh.points, mesh.clearance
         self._normals = mesh.normals
         self._angles = rng.uniform(0, 2 * np.pi, len(mesh.points)).astype(np.float32)
         self._set_of_point = rng.integers(0, sets, len(mesh.points), dtype=np.uint8)
@@ -129,14 +129,19 @@ class BlockedEstimator:
 
         directions: of one set, as `_jobs` lifts them, with harmonics (r, K); or (sets, r, 3) with (sets, r, K).
         """
-        frames = self._frames(points).astype(np.float32)
+        frames = sampling.frames(self._normals[points].astype(np.float32), self._angles[points])
         count = harmonics.shape[-2]
         if mixed := harmonics.ndim == 3:
             here = self._set_of_point[points]
-            world = (directions[here] @ frames.transpose(0, 2, 1)).reshape(-1, 3)
+            rows = frames.transpose(1, 2, 0)  # (3, 3, n)
+            world = np.empty((len(points), count, 3), np.float32)
+            for number, (x, y, z) in enumerate(directions.transpose(1, 2, 0)[:, :, here]):
+                for axis, (tangent, bitangent, normal) in enumerate(rows):
+                    world[:, number, axis] = x * tangent + y * bitangent + z * normal
+            world = world.reshape(-1, 3)
         else:
-            world = product(frames.reshape(-1, 9), directions).reshape(-1, 3)
-        origins = np.repeat(self._origins[points], count, axis=0)
+            world = product(np.ascontiguousarray(frames).reshape(-1, 9), directions).reshape(-1, 3)
+        origins = np.repeat(self._occluders.origins(self._points[points], self._clearance[points]), count, axis=0)
         free = self._occluders.blocked(origins, world)  # 0 blocked, -1 free
         blocked = np.add(free, 1, dtype=np.float64).reshape(-1, count)
         return np.einsum("nr,nrk->nk", blocked, harmonics[here]) if mixed else product(blocked, harmonics)
@@ -167,19 +172,22 @@ class BlockedEstimator:
         list(pool.map(part, range(0, len(points), _TURNED_AT_ONCE)))
         return out
 
-    def turned(self, pool: ThreadPoolExecutor, points: NDArray, local: NDArray) -> NDArray[np.float32]:
-        """The blocked part (n, K), local, in the bake frame."""
-        out = np.empty(local.shape, np.float32)
+    def blocked(self, pool: ThreadPoolExecutor, points: NDArray, sums: NDArray, stop: int) -> NDArray[np.float32]:
+        """The blocked part (n, K) in the bake frame, from sums over directions 0..stop."""
+        out = np.empty(sums.shape, np.float32)
 
         def part(start: int) -> None:
             here = slice(start, start + _TURNED_AT_ONCE)
-            out[here] = self.turned_here(points[here], local[here])
+            out[here] = self.turned_here(points[here], self.means(points[here], sums[here], 0, stop))
 
         list(pool.map(part, range(0, len(points), _TURNED_AT_ONCE)))
         return out
 
     def turned_here(self, points: NDArray, local: NDArray) -> NDArray[np.float64]:
-        """`turned` of a few points, on the calling thread. Where nothing is blocked, nothing is turned."""
+        """The blocked part (n, K), local, in the bake frame; on the calling thread.
+
+        Where nothing is blocked, nothing is turned.
+        """
         out = np.zeros(local.shape)
         some = np.flatnonzero(local[:, 0])
         out[some] = sh.rotate_each(local[some], self._frames(points[some]))
@@ -196,15 +204,22 @@ def _upright_lobe(order: int) -> NDArray[np.float64]:
 
 
 def morton_order(points: NDArray) -> NDArray[np.int64]:
-    """Indices (N,) that walk the points (N, 3) along a Z-order curve: neighbours in it are near in space."""
+    """Indices (N,) that walk the points (N, 3) along a Z-order curve: neighbours in it are near in space.
+
+    Points in one cell, a 65,536th of the extent or so, keep their order.
+    """
     rows = np.ascontiguousarray(points.T)  # NumPy is quick along long last axes
     low = rows.min(1, keepdims=True)
     extent = float((rows.max(1, keepdims=True) - low).max()) or 1.0
     # not at the corner of the cube that the curve fills: planes of symmetry would lie between its halves, and rounding
     # would decide on which side a point is
-    cells = ((0.0618 + 0.8 * (rows - low) / extent) * 2**20).astype(np.uint64)
-    for shift, mask in ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
-                        (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)):
+    cells = ((rows - (low - 0.0618 / 0.8 * extent)) * (0.8 * 2**16 / extent)).astype(np.uint64)
+    for shift, mask in ((16, 0xFF0000FF), (8, 0xF00F00F00F), (4, 0xC30C30C30C3), (2, 0x249249249249)):
         cells |= cells << np.uint64(shift)
         cells &= np.uint64(mask)
-    return np.argsort(cells[0] | cells[1] << np.uint64(1) | cells[2] << np.uint64(2), kind="stable")
+    key = cells[0] | cells[1] << np.uint64(1) | cells[2] << np.uint64(2)
+    # NumPy sorts 16 bits by their digits, in a fifth of the time that comparing takes: the lowest of three first
+    order = np.argsort(key.astype(np.uint16), kind="stable")
+    for shift in (16, 32):
+        order = order[np.argsort((key >> np.uint64(shift)).astype(np.uint16)[order], kind="stable")]
+    return order

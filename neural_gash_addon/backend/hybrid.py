@@ -74,7 +74,12 @@ def _first_of_the_greatest(values: NDArray) -> int:
 
 def curves(places: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """For each pass, indices (N,) that walk the points (N, 3), `placed`, along a curve."""
-    return morton_order(places), morton_order(_turned(_TURN.T, places.T))
+    return morton_order(places), second_curve(places)
+
+
+def second_curve(places: NDArray) -> NDArray[np.int64]:
+    """The second of `curves`. The first is `morton_order` itself."""
+    return morton_order(_turned(_TURN.T, places.T))
 
 
 def _turned(axes: NDArray, rows: NDArray) -> NDArray[np.float64]:
@@ -99,35 +104,64 @@ def filtered(places: NDArray, normals: NDArray, orders: Sequence[NDArray], block
         (N, K).
     """
     count, terms = blocked.shape
-    even = unshadowed[:, 1:] / np.float32(FULL)
-    now = np.ones((count + 1, terms + 1), np.float32)  # the last column counts, in sums over neighbours
-    now[:-1, :terms] = blocked
-    now[:-1, 1:terms] -= now[:-1, :1] * even
     known = np.concatenate([places.T, normals.T], dtype=np.float32)
-    for order, layers in zip(orders, network, strict=True):
-        out = now.copy()
+    now = blocked
+    for number, (order, layers) in enumerate(zip(orders, network, strict=True)):
+        first, last = number == 0, number == len(network) - 1
+        out = np.empty((count + 1, terms if last else terms + 1), np.float32)
         every = blocks(order)
         into = every.copy()
         into[-1:, :-len(order) % every.shape[1]] = count  # the last row is for what the block before has already
         step = int(np.clip(len(every) // 4 + 1, *_BLOCKS))  # work for all threads, where it is enough
 
         def part(start: int, now: NDArray = now, out: NDArray = out, every: NDArray = every, into: NDArray = into,
-                 step: int = step, layers: Sequence[Layer] = layers) -> None:
+                 step: int = step, layers: Sequence[Layer] = layers, first: bool = first, last: bool = last) -> None:
             rows, targets = every[start:start + step], into[start:start + step]
-            values = now.take(rows, 0)
+            if first or last:
+                even = unshadowed.take(rows, 0)[..., 1:]
+                even /= np.float32(FULL)
+            if first:  # the last column counts, in sums over neighbours
+                values = np.ones((*rows.shape, terms + 1), np.float32)
+                now.take(rows, 0, out=values[..., :terms], mode="clip")
+                values[..., 1:terms] -= values[..., :1] * even
+            else:
+                values = now.take(rows, 0)
             seen = values[..., 0].any(1)
-            if not seen.any():
-                return
-            if not seen.all():
-                rows, targets, values = rows[seen], targets[seen], values[seen]
-            here = known.take(rows, 1)
-            out[targets.ravel(), :terms] = mixed(here[:3], here[3:], values, rays, layers).reshape(-1, terms)
+            if seen.all():
+                here = known.take(rows, 1)
+                values[..., :terms] = mixed(here[:3], here[3:], values, rays, layers)
+            elif seen.any():
+                here = known.take(rows[seen], 1)
+                values[seen, :, :terms] = mixed(here[:3], here[3:], values[seen], rays, layers)
+            if last:
+                values = values[..., :terms]
+                values[..., 1:] += values[..., :1] * even
+            out[targets.ravel()] = values.reshape(-1, values.shape[2])
 
         list(pool.map(part, range(0, len(every), step)))
         now = out
-    found = now[:-1, :terms].copy()
-    found[:, 1:] += found[:, :1] * even
-    return found
+    return now[:-1]
+
+
+def between(some: NDArray[np.float32], unshadowed: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The blocked part of all points (n, K) along a curve, from that of the first, the third and so on.
+
+    The others take the mean of the two beside them, as `filtered` passes on what is blocked.
+
+    Args:
+        some: (ceil(n / 2), K). unshadowed: (n, K).
+    """
+    even = unshadowed[:, 1:] / np.float32(FULL)
+    values = some.copy()
+    values[:, 1:] -= values[:, :1] * even[::2]
+    out = np.empty(unshadowed.shape, np.float32)
+    out[::2] = some
+    gaps = out[1::2]
+    gaps[:] = values[:len(gaps)]
+    gaps[:len(values) - 1] += values[1:]
+    gaps[:len(values) - 1] *= np.float32(0.5)
+    gaps[:, 1:] += gaps[:, :1] * even[1::2]
+    return out
 
 
 def blocks(order: NDArray) -> NDArray[np.int64]:

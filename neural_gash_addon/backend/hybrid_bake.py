@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from . import spherical_harmonics as sh
 from .estimator import MAX_RAYS, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
-from .hybrid import SIZE, Network, curves, filtered, placed
+from .hybrid import SIZE, Network, between, filtered, placed, second_curve
 from .pilot import Pilot, pilot_rays, sample_size
 from .progress import run, scaled
 from .raycast import Geometry, Occluders
@@ -37,8 +37,9 @@ FEWEST, MOST_DOUBLED = 20 * SIZE, 64
 _ROWS = 1 << 14       # whose unshadowed transfer one worker computes at a time
 _SAMPLE = 128         # points at which the error is measured, or a 256th of them if that is more
 _MOST_SAMPLE = 2048
-# Rays of each of two independent traces there, where the bake's are given: a larger error needs fewer to be measured.
-_SAMPLE_TIMES, _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS = 2, 8, 128
+# Rays of each of two independent traces there, where the bake's are given: as many as those, or twice as many where
+# that is little beside the rays of all points. A larger error needs fewer to be measured.
+_TWICE_FROM, _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS = 8192, 8, 128
 
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
@@ -47,7 +48,8 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     """Trace `mesh` against itself and `occluders`, and take from neighbours; arguments as `methods.bake`.
 
     With a tolerance there are more rays until the measured error is within it, or they are MAX_RAYS. Of fewer than
-    FEWEST points up to twice the rays are traced, and the network is not asked.
+    FEWEST points up to twice the rays are traced, and the network is not asked. Of more, one ray from each point is two
+    from every other one.
 
     pilot: what is known beforehand; its points are those at which the error is measured.
     """
@@ -121,7 +123,7 @@ class _Work:
     def __init__(self, mesh: TriangleMesh, scene: Occluders, order: int, seed: int, rays: int, lit: NDArray,
                  pool: ThreadPoolExecutor, threads: int, network: Network | None, tolerance: float | None = None
                  ) -> None:
-        self._estimator = BlockedEstimator(mesh, scene, order, seed, rays)
+        self._estimator = BlockedEstimator(mesh, scene, order, seed, max(rays, 2))
         self._mesh, self._scene, self._order, self._seed = mesh, scene, order, seed
         self._pool, self._threads, self._network = pool, threads, network
         count = len(lit)
@@ -130,21 +132,27 @@ class _Work:
             self.lit = lit[morton_order(mesh.points[lit])] if count else lit
         else:
             places, normals = placed(mesh.points[lit], mesh.normals[lit])
-            first, second = curves(places)
-            self.lit, self._placed = lit[first], (places[first], normals[first])
-            self._curves = [np.arange(count), np.argsort(first)[second]]
-        self.unshadowed = np.empty((count, sh.coefficient_count(order)), np.float32)  # (n, K)
+            first = morton_order(places)
+            self.lit = lit[first]
+
+            def walked() -> tuple[NDArray, NDArray, tuple[NDArray, NDArray]]:
+                here = places[first]
+                return here, normals[first], (np.arange(count), second_curve(here))
+
+            self._placed = pool.submit(walked)  # beside the rest, which waits for rays
+        self.unshadowed = np.empty((count, sh.coefficient_count(order)), np.float32)  # (n, K), `filled`
 
         def fill(start: int) -> None:
             rows = slice(start, start + _ROWS)
             self.unshadowed[rows] = sh.cosine_lobe(mesh.normals[self.lit[rows]], order)
 
-        list(pool.map(fill, range(0, count, _ROWS)))
+        self._filled = pool.map(fill, range(0, count, _ROWS))
         self._sums = np.zeros(self.unshadowed.shape)
         # without the network, as much as a bake by rays alone traces anew to measure its error, or less
-        most, times = (count, _SAMPLE_TIMES) if network else (-(-count // 2), 1)
+        most = count if network else -(-count // 2)
+        times = float(np.clip(2 * count / _TWICE_FROM, 1, 2))
         self._sample_size = min(most, max(_SAMPLE, min(count // 256, _MOST_SAMPLE)))
-        self._sample_rays = int(np.clip(times * rays, _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS))
+        self._sample_rays = int(np.clip(round(times * rays), _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS))
         if tolerance is not None:
             self._sample_size, self._sample_rays = sample_size(count), pilot_rays(tolerance)
         self.probes = 2 * self._sample_size * self._sample_rays
@@ -152,14 +160,23 @@ class _Work:
     def trace(self, start: int, stop: int) -> Generator[float, None, tuple[NDArray[np.float32], NDArray[np.float32]]]:
         """The blocked part of all points from directions start..stop in addition to those before.
 
+        Where `stop` is 1, two rays are traced from every other point along the curve.
+
         Returns:
             (n, K) as it was traced, and as the network has it, if there is one.
         """
-        yield from self._estimator.trace(self._pool, self._threads, self.lit, start, stop, self._sums)
-        traced = self._estimator.turned(self._pool, self.lit, self._estimator.means(self.lit, self._sums, 0, stop))
+        half = self._network is not None and stop == 1  # one ray says nothing of where it came from, two do
+        if half:
+            stop = 2
+        lit, sums = (self.lit[::2], self._sums[::2]) if half else (self.lit, self._sums)
+        yield from self._estimator.trace(self._pool, self._threads, lit, start, stop, sums)
+        list(self._filled)
+        traced = self._estimator.blocked(self._pool, lit, sums, stop)
+        if half:
+            traced = between(traced, self.unshadowed)
         if self._network is None:
             return traced, traced
-        return traced, filtered(*self._placed, self._curves, traced, self.unshadowed, stop, self._network, self._pool)
+        return traced, filtered(*self._placed.result(), traced, self.unshadowed, stop, self._network, self._pool)
 
     def sample(self) -> tuple[NDArray, NDArray, NDArray]:
         """Some of the points (s,), and two independent traces (s, K) of their blocked part; on the calling thread."""

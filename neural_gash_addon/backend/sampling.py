@@ -17,7 +17,7 @@ def sobol2(count: int) -> NDArray[np.uint32]:
     index = np.arange(count, dtype=np.uint32)
     out = np.zeros((count, 2), dtype=np.uint32)
     vector = np.uint32(1 << 31)
-    for bit in range(32):
+    for bit in range(max(count - 1, 0).bit_length()):  # of the indices; the others are 0
         set_here = (index >> np.uint32(bit)) & np.uint32(1)
         out[:, 0] ^= set_here * np.uint32(1 << (31 - bit))
         out[:, 1] ^= set_here * vector
@@ -60,23 +60,28 @@ def hemisphere_sets(sets: int, count: int, seed: int) -> NDArray[np.float64]:
     return np.stack([radius * np.cos(phi), radius * np.sin(phi), np.sqrt(1 - u[..., 0])], -1)
 
 
-def frames(normals: NDArray, angles: NDArray) -> NDArray[np.float64]:
+def frames(normals: NDArray, angles: NDArray) -> NDArray:
     """Rotations that carry +z to each normal, turned by an angle about it.
 
     Args:
-        normals: (N, 3) unit vectors. angles: (N,) radians.
+        normals: (N, 3) unit vectors. angles: (N,) radians. Both of one type of float, in which all is done.
     Returns:
-        (N, 3, 3) float64 whose columns are tangent, bitangent and normal. Nowhere singular
-        (Duff et al. 2017, "Building an orthonormal basis, revisited").
+        (N, 3, 3) whose columns are tangent, bitangent and normal; in memory the points are last, as NumPy likes it.
+        Nowhere singular (Duff et al. 2017, "Building an orthonormal basis, revisited").
     """
-    x, y, z = np.asarray(normals, dtype=np.float64).T
-    sign = np.where(z >= 0, 1.0, -1.0)
-    a = -1.0 / (sign + z)
+    x, y, z = np.ascontiguousarray(normals.T)
+    sign = np.where(z >= 0, x.dtype.type(1), x.dtype.type(-1))
+    a = -1 / (sign + z)
     b = x * y * a
-    first = np.stack([1 + sign * x * x * a, sign * b, -sign * x], 1)
-    second = np.stack([b, sign + y * y * a, -y], 1)
-    c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]
-    return np.stack([c * first + s * second, c * second - s * first, np.stack([x, y, z], 1)], 2)
+    c, s = np.cos(angles), np.sin(angles)
+    out = np.empty((3, 3, len(x)), x.dtype)
+    first = 1 + sign * x * x * a, sign * b, -sign * x
+    second = b, sign + y * y * a, -y
+    for row, normal, one, two in zip(out, (x, y, z), first, second, strict=True):
+        row[0] = c * one + s * two
+        row[1] = c * two - s * one
+        row[2] = normal
+    return out.transpose(2, 0, 1)
 
 
 def on_triangles(cumulative: NDArray, pairs: NDArray) -> tuple[NDArray[np.int64], NDArray, NDArray]:

@@ -239,7 +239,7 @@ class _Work:
         rows = np.arange(len(points))
         sums = np.zeros((len(points), sh.coefficient_count(self._order)))
         yield from estimator.trace(self._pool, self._threads, rows, 0, rays, sums)
-        return estimator.turned(self._pool, rows, estimator.means(rows, sums, 0, rays)).astype(np.float64)
+        return estimator.blocked(self._pool, rows, sums, rays).astype(np.float64)
 
 
 def _levelled(blocked: NDArray, unshadowed: NDArray, sign: int) -> NDArray[np.float32]:

@@ -161,7 +161,7 @@ def rotate_each(coefficients: NDArray, rotations: NDArray) -> Array:
     out = np.empty_like(c)
     for start in range(0, len(c), _BLOCK):
         part = slice(start, start + _BLOCK)
-        matrices = np.ascontiguousarray(rotations[part].reshape(-1, 9).T, dtype=np.float64)  # (9, B)
+        matrices = np.ascontiguousarray(rotations[part].transpose(1, 2, 0), dtype=np.float64).reshape(9, -1)
         rows = np.ascontiguousarray(c[part].T)
         total = np.zeros_like(rows)
         total[0] = rows[0]

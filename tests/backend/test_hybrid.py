@@ -118,6 +118,33 @@ def test_takes_most_of_the_noise_away(case, rays, factor):
     assert better < factor * plain
 
 
+@pytest.mark.parametrize("count", [6, 7])
+def test_points_between_others_see_as_much_and_differ_from_an_even_sky_alike(count):
+    rng = np.random.default_rng(count)
+    unshadowed = sh.cosine_lobe(_unit(rng.normal(size=(count, 3))), 3)
+    some = rng.normal(size=(-(-count // 2), 9)).astype(np.float32)
+    found = hybrid.between(some, unshadowed.astype(np.float32))
+    for i in range(count):
+        beside = [i] if i % 2 == 0 else [j for j in (i - 1, i + 1) if j < count]
+        share = np.mean([some[j // 2, 0] for j in beside])
+        differs = np.mean([some[j // 2] - some[j // 2, 0] * unshadowed[j] / unshadowed[j, 0] for j in beside], axis=0)
+        np.testing.assert_allclose(found[i], share * unshadowed[i] / unshadowed[i, 0] + differs, atol=1e-5)
+
+
+def _unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def test_one_ray_a_point_is_two_from_every_other_one_and_better_than_two_from_each_without_the_network(case):
+    mesh, unshadowed, truth = case
+    one, two = bake(mesh, rays=1), bake(mesh, "embree", 2)
+    assert one.record.rays == len(mesh.points)
+    assert metrics.srr(one.coefficients, truth, unshadowed) < 0.5 * metrics.srr(two.coefficients, truth, unshadowed)
+    ball = TriangleMesh.from_triangles(*shapes.sphere())
+    assert len(ball.points) >= hybrid_bake.FEWEST
+    np.testing.assert_allclose(bake(ball, rays=1).coefficients, sh.cosine_lobe(ball.normals, 3), atol=1e-6)
+
+
 def test_with_many_rays_the_traced_value_stays(case):
     mesh, unshadowed, truth = case
     for order in (2, 5):
