@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from . import embedding, sampling, weights
 from . import spherical_harmonics as sh
 from .estimator import BlockedEstimator, morton_order
-from .geometry import TEXEL, TriangleMesh
+from .geometry import CORNER, TEXEL, TriangleMesh
 from .hybrid import FULL
 from .nearest import nearest_to
 from .paper_bake import import_torch
@@ -65,7 +65,10 @@ def _with_even(values: NDArray, normals: NDArray, sign: float) -> NDArray[np.flo
 
 
 def on_surface(mesh: TriangleMesh, count: int, seed: int) -> TriangleMesh:
-    """Points of a mesh by area, `count` in farthest-point order, each of its face; none where it has no area."""
+    """Points of a mesh by area, `count` in farthest-point order, each of its face; none where it has no area.
+
+    They face to the side that is shaded, where the mesh says which that is (`TEXEL` does not).
+    """
     corners = mesh.positions[mesh.triangles]
     double = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     sizes = np.linalg.norm(double, axis=1)
@@ -77,6 +80,10 @@ def on_surface(mesh: TriangleMesh, count: int, seed: int) -> TriangleMesh:
         here = corners[faces]
         candidates = here[:, 0] + u[:, None] * (here[:, 1] - here[:, 0]) + v[:, None] * (here[:, 2] - here[:, 0])
         facing = double[faces] / sizes[faces, None]
+        of_corner = mesh.corners if mesh.domain == CORNER else mesh.triangles
+        if mesh.domain != TEXEL and of_corner is not None:
+            shading = mesh.normals[mesh.elements[of_corner[faces]]].sum(1)
+            facing *= np.where((shading * facing).sum(1) < 0, -1, 1)[:, None]
         spacing = float(np.sqrt(sizes.sum() / 2 / count))
         scale = 1 / float(np.ptp(candidates, axis=0).max() or 1.0)  # what is compared are squares
         kept = farthest(scale * np.concatenate([candidates, TURN * spacing * facing], 1), count)
@@ -95,7 +102,7 @@ def traced(points: TriangleMesh, occluders: Occluders, order: int, rays: int, se
     sums, out = np.zeros((len(rows), order * order)), np.zeros((len(rows), order * order))
     with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
         yield from estimator.trace(pool, threads, rows, 0, rays, sums)
-        out[rows] = estimator.turned(pool, rows, estimator.means(rows, sums, 0, rays))
+        out[rows] = estimator.blocked(pool, rows, sums, rays)
     return out
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The embedding for the light of the sky: what holds by construction, and what was learned."""
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -199,3 +200,11 @@ def test_without_torch_or_weights_one_sentence_says_so(monkeypatch, tmp_path):
 
 def test_bands_are_those_of_the_coefficients():
     assert networks.bands(25).tolist() == [0] + [1] * 3 + [2] * 5 + [3] * 7 + [4] * 9
+
+
+def test_scene_points_face_to_the_side_that_is_shaded():
+    mesh = torus()
+    inside = replace(mesh, normals=-mesh.normals, clearance=-mesh.clearance)
+    found = bake(inside)
+    assert np.abs(found.coefficients).max() < 0.02  # it looks into the ring, where all is dark
+    assert found.record.error_estimate is None or found.record.error_estimate >= 0

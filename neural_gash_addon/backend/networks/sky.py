@@ -61,7 +61,8 @@ class Encoder(nn.Module):
         self.norm = nn.LayerNorm(width)
         self.blocks = nn.ModuleList(Block(width, settings.patch) for _ in range(settings.blocks))
         self.leave = nn.LayerNorm(width)
-        self.share = _silent(nn.Linear(width, (1 + POOLS) * MAX_ORDER))
+        self.share = nn.Linear(width, (1 + POOLS) * MAX_ORDER)
+        _silent(self.share)
         self.own = _perceptron(SEEN, hidden, 2 * hidden)
         self.key_value = nn.Linear(width, 2 * hidden)
 
@@ -105,7 +106,8 @@ class Decoder(nn.Module):
         self.lie = _perceptron(RELATION, hidden, 2 * hidden)
         self.weigh = nn.Linear(hidden, MAX_ORDER + hidden, bias=False)
         self.norm = nn.LayerNorm(hidden)
-        self.enter, self.finish = nn.Linear(hidden, hidden), _silent(nn.Linear(hidden, MAX_ORDER))
+        self.enter, self.finish = nn.Linear(hidden, hidden), nn.Linear(hidden, MAX_ORDER)
+        _silent(self.finish)
 
     def forward(self, codes: Codes, frame: Frame, places: Tensor, normals: Tensor, near: Tensor) -> Tensor:
         """(n, K).
