@@ -14,17 +14,10 @@ from . import sampling
 from .estimator import morton_order
 from .lit_scene import LitScene
 
-FEWEST, MOST = 1024, 20_000
-DENSITY = 32.0    # points to a square metre, between those limits
 EMITTERS = 3.0    # times as close as elsewhere are points on what emits
 CANDIDATES = 8    # for each point
 TURN = 0.25       # of the mean spacing: as far apart count normals at one radian; two sides of a plate half a spacing
 _BUCKET = 256     # candidates updated together
-
-
-def count_for(scene: LitScene) -> int:
-    """How many points represent a scene of this extent."""
-    return int(np.clip(round(DENSITY * float(scene.areas.sum())), FEWEST, MOST))
 
 
 def scene_points(scene: LitScene, count: int, seed: int = 0) -> NDArray[np.float32]:
