@@ -88,7 +88,8 @@ def test_the_undisturbed_truth_is_the_bake_with_many_rays():
 def test_what_is_there_is_not_run_again(tmp_path, monkeypatch, capsys):
     import json
     out, page = tmp_path / "stability.json", tmp_path / "page.md"
-    page.write_text("".join(f"<!-- {name} -->\n<!-- end -->\n" for name in ("origin", "table", "noise", "red")))
+    page.write_text("".join(f"<!-- {name} -->\n<!-- end -->\n" for name in
+                            ("origin", "table", "noise", "red", "rooms")))
     monkeypatch.setattr(sys, "argv", ["stability", "--quick", "--only", "dark", "--out", str(out), "--page", str(page)])
     assert stability.main() == 0
     known = json.loads(out.read_text())
@@ -97,3 +98,17 @@ def test_what_is_there_is_not_run_again(tmp_path, monkeypatch, capsys):
     first = page.read_text()
     assert stability.main() == 0 and page.read_text() == first and "| dark | 0 / 0 %" in first
     assert "Commit: " in first and json.loads(out.read_text()) == known
+
+
+def test_a_method_that_is_another_now_is_tried_alone(tmp_path, monkeypatch):
+    import json
+    out = tmp_path / "stability.json"
+    monkeypatch.setattr(sys, "argv", ["stability", "--quick", "--only", "dark", "--out", str(out)])
+    assert stability.main() == 0
+    known, asked, tried = json.loads(out.read_text())["trials"]["dark"]["cells"], [], stability.tried
+    monkeypatch.setattr(stability, "tried", lambda group, trial, scale, chosen: asked.extend(chosen)
+                        or tried(group, trial, scale, chosen))
+    monkeypatch.setattr(sys, "argv", [*sys.argv, "--again", "gnn"])
+    assert stability.main() == 0
+    assert [setting.method for setting in asked] == ["gnn"]
+    assert json.loads(out.read_text())["trials"]["dark"]["cells"] == known  # in the same order
