@@ -1,24 +1,24 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Whether the points of a bake are fine enough for its shadows, and how large a texture would be (advice of `auto`).
+"""Whether the points of a bake are fine enough for its shadows, and how large a texture would have to be (of `auto`).
 
-Where to bake to is the person's choice, so this changes nothing. Points inside faces, spread by area, are traced twice
-with rays of their own, and compared with what their faces' corners say between them. The product of both differences is
-the error without the noise of these rays. Where it misses the tolerance, the same is done with lookups as a texture has
-them: four points of the surface, a texel apart. How the error falls from a coarse to a fine one says which is enough.
+Points inside faces, by area, are traced twice with rays of their own, and compared with what their faces' corners
+say between them. The product of both differences is the error without the noise of these rays. For the size of a
+texture, the same is done with lookups as a texture has them: four points of the surface, a texel apart. How the error
+falls from a coarse to a fine one says which is enough.
 """
 from __future__ import annotations
 
 from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import sampling
 from . import spherical_harmonics as sh
-from .estimator import BlockedEstimator
 from .geometry import CORNER, TEXEL, Surface, TriangleMesh, unit
-from .pilot import pilot_rays
+from .pilot import pilot_rays, twice
 from .raster import Coverage
 from .raycast import Occluders
 from .texels import texel_points
@@ -26,7 +26,6 @@ from .texels import texel_points
 _POINTS = 96
 _MOST_RAYS = 32       # of each trace of them,
 _TRIAL_RAYS = 16      # and of each texel's: four of them are averaged
-_SETS = 4
 _OWN_NOISE = 1.25     # of the tolerance: what corners that just keep to it may differ by inside faces that hold no edge
 _TRIALS = 128, 512    # texels a side of the textures that are tried
 _LEAST_RATE, _MOST_RATE = 0.5, 2.0  # powers of the side by which an error falls: at a shadow's edge, where smooth
@@ -47,61 +46,94 @@ def domain(mesh: TriangleMesh) -> str:
     return "Shading is smooth, so each vertex has one value."
 
 
-def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray[np.float32], order: int, tolerance: float,
-                 seed: int, threads: int) -> Generator[float, None, str]:
-    """One sentence: whether shadows inside faces follow their corners, or the texture that would have them.
+class Inside(NamedTuple):
+    """What n points inside faces say."""
+
+    error: float      # of what corners say between them, relative L2, without the noise of these rays
+    energy: float     # squares of transfer, summed
+    faces: NDArray[np.int64]     # (n,) in which they lie, and
+    weights: NDArray[np.float64]  # (n, 3) where
+    traced: Traced    # (n, K) transfer, twice
+
+
+def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray, order: int, tolerance: float,
+                 seed: int, threads: int) -> Generator[float, None, Inside | None]:
+    """Look whether shadows inside faces follow their corners.
 
     Args:
         coefficients: (N, K) of the points of the mesh. scene: what blocks, the mesh first.
     Yields:
         Progress.
     Returns:
-        '' where the mesh does not say which points its faces lie between, or it is dark.
+        None where the mesh does not say which points its faces lie between, or it is dark.
     """
-    of_corner = mesh.corners if mesh.domain == CORNER else mesh.triangles
-    places = mesh.positions[mesh.triangles]
-    areas = np.linalg.norm(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]), axis=1) / 2
-    if mesh.domain == TEXEL or of_corner is None or not areas.sum() > 0:
-        return ""
-    of_corner = mesh.elements[of_corner]
+    of_corner = _of_corner(mesh)
+    areas = _areas(mesh)
+    if of_corner is None or not areas.sum() > 0:
+        return None
     rng = np.random.default_rng([seed, 6])
-
-    def traced(points: TriangleMesh, rays: int) -> Generator[float, None, Traced]:
-        rows, found = np.arange(len(points.points)), []
-        with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
-            for _ in range(2):
-                twin = BlockedEstimator(points, scene, order, int(rng.integers(2**31)), rays, _SETS)
-                sums = np.zeros((len(rows), order * order))
-                yield from twin.trace(pool, threads, rows, 0, rays, sums)
-                blocked = twin.turned_here(rows, twin.means(rows, sums, 0, rays))
-                found.append(sh.cosine_lobe(points.normals, order) - blocked)
-        return found[0], found[1]
-
     faces, u, v = sampling.on_triangles(np.cumsum(areas), rng.random((2, _POINTS)))
     weights = np.stack([1 - u - v, u, v], 1)
     some = _points(mesh, of_corner, faces, weights)
-    one, two = yield from traced(some, min(pilot_rays(tolerance), _MOST_RAYS))
+    one, two = yield from _traced(some, scene, order, min(pilot_rays(tolerance), _MOST_RAYS), rng, threads)
     energy = float((one * two).sum())
     if energy <= _DARK ** 2 * float(np.square(sh.cosine_lobe(some.normals, order)).sum()):
-        return ""
+        return None
     baked = np.einsum("nc,nck->nk", weights, coefficients[of_corner[faces]].astype(np.float64))
-    error = _product(one - baked, two - baked, energy)
-    if error <= _OWN_NOISE * tolerance:
-        return f"Shadows inside faces follow their corners to {max(100 * error, 1):.0f} %: vertices are enough."
-    errors = []
-    for side in _TRIALS:
-        spacing = float(areas.sum() / _FULL) ** 0.5 / side
-        near, at, mix = around(mesh, scene, faces, weights, spacing, rng)
-        first, second = yield from traced(_points(mesh, of_corner, near, at), _TRIAL_RAYS)
+    return Inside(_product(one - baked, two - baked, energy), energy, faces, weights, (one, two))
+
+
+def missed(inside: Inside, tolerance: float) -> bool:
+    """Whether shadows inside faces are missed by their corners."""
+    return inside.error > _OWN_NOISE * tolerance
+
+
+def said(inside: Inside, tolerance: float) -> str:
+    """One sentence of it."""
+    if missed(inside, tolerance):
+        return f"Shadow edges inside faces are missed by their corners ({100 * inside.error:.0f} %): a texture would " \
+               "have them."
+    return f"Shadows inside faces follow their corners to {max(100 * inside.error, 1):.0f} %: vertices are enough."
+
+
+def side(mesh: TriangleMesh, scene: Occluders, inside: Inside, order: int, tolerance: float, seed: int, threads: int
+         ) -> Generator[float, None, int]:
+    """The side of the texture, a power of two, that would have the shadows inside faces. Yields progress."""
+    of_corner = _of_corner(mesh)
+    assert of_corner is not None
+    area, rng, errors = float(_areas(mesh).sum()), np.random.default_rng([seed, 7]), []
+    for tried in _TRIALS:
+        spacing = (area / _FULL) ** 0.5 / tried
+        near, at, mix = around(mesh, scene, inside.faces, inside.weights, spacing, rng)
+        read = yield from _traced(_points(mesh, of_corner, near, at), scene, order, _TRIAL_RAYS, rng, threads)
         seen = mix.any(1)[:, None]
-        first, second = (np.einsum("nc,nck->nk", mix, found.reshape(*mix.shape, -1)) for found in (first, second))
-        errors.append(max(_product(seen * (one - first), seen * (two - second), energy), 1e-3 * tolerance))
+        off = [seen * (true - np.einsum("nc,nck->nk", mix, texels.reshape(*mix.shape, -1)))
+               for true, texels in zip(inside.traced, read, strict=True)]
+        errors.append(max(_product(off[0], off[1], inside.energy), 1e-3 * tolerance))
     rate = np.clip(np.log(errors[0] / errors[1]) / np.log(_TRIALS[1] / _TRIALS[0]), _LEAST_RATE, _MOST_RATE)
     nearest = int(abs(np.log(errors[1] / tolerance)) < abs(np.log(errors[0] / tolerance)))
-    side = _TRIALS[nearest] * (errors[nearest] / tolerance) ** (1 / rate)
-    side = 2 ** round(float(np.log2(np.clip(side, *_SIDES))))
-    return f"Shadow edges inside faces are missed by their corners ({100 * error:.0f} %): a texture of about {side} " \
-           "would have them."
+    found = _TRIALS[nearest] * (errors[nearest] / tolerance) ** (1 / rate)
+    return int(2 ** round(float(np.log2(np.clip(found, *_SIDES)))))
+
+
+def _of_corner(mesh: TriangleMesh) -> NDArray | None:
+    """(F, 3) points that faces lie between, where the mesh says which."""
+    of_corner = mesh.corners if mesh.domain == CORNER else mesh.triangles
+    return None if mesh.domain == TEXEL or of_corner is None else mesh.elements[of_corner]
+
+
+def _areas(mesh: TriangleMesh) -> NDArray[np.float64]:
+    places = mesh.positions[mesh.triangles]
+    return np.linalg.norm(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]), axis=1) / 2
+
+
+def _traced(points: TriangleMesh, scene: Occluders, order: int, rays: int, rng: np.random.Generator, threads: int
+            ) -> Generator[float, None, Traced]:
+    """Transfer of points, twice, with rays of their own. Yields progress."""
+    with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+        blocked = yield from twice(points, scene, order, rays, int(rng.integers(2**31)), pool, threads)
+    unshadowed = sh.cosine_lobe(points.normals, order)
+    return unshadowed - blocked[0], unshadowed - blocked[1]
 
 
 def around(mesh: TriangleMesh, scene: Occluders, faces: NDArray, weights: NDArray, spacing: float,

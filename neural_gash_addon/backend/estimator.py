@@ -36,11 +36,12 @@ _TURNED_AT_ONCE = 2048  # points rotated by one worker at a time
 class BlockedEstimator:
     """Sums of Y_k over blocked rays, in each point's local frame."""
 
-    def __init__(self, mesh: TriangleMesh, occluders: Occluders, order: int, seed: int, rays: int, sets: int = SETS
-                 ) -> None:
+    def __init__(self, mesh: TriangleMesh, occluders: Occluders, order: int, seed: int, rays: int, sets: int = SETS,
+                 twins: bool = False) -> None:
         """rays: the most that any point will take. seed: independent seeds give independent estimates.
 
-        sets: fewer cost less where points are few, whose errors are then less independent.
+        sets: fewer cost less where points are few, whose errors are then less independent. twins: the second half of
+        the points is the first again, whose errors have to be independent: none has the set of its twin.
         """
         rng = np.random.default_rng([seed, 0])
         self._occluders = occluders
@@ -51,6 +52,9 @@ class BlockedEstimator:
         self._normals = mesh.normals
         self._angles = rng.uniform(0, 2 * np.pi, len(mesh.points)).astype(np.float32)
         self._set_of_point = rng.integers(0, sets, len(mesh.points), dtype=np.uint8)
+        if twins:
+            first, second = np.split(self._set_of_point, 2)
+            second[:] = (first + rng.integers(1, sets, len(second), dtype=np.uint8)) % sets
         self._excess: dict[tuple[int, int], NDArray] = {}
         self._evaluated: tuple[tuple[int, int], NDArray] | None = None  # the last of `_harmonics`
 
