@@ -67,19 +67,18 @@ def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray, or
     Returns:
         None where the mesh does not say which points its faces lie between, or it is dark.
     """
-    of_corner = _of_corner(mesh)
     areas = _areas(mesh)
-    if of_corner is None or not areas.sum() > 0:
+    if mesh.domain == TEXEL or (mesh.domain == CORNER and mesh.corners is None) or not areas.sum() > 0:
         return None
     rng = np.random.default_rng([seed, 6])
     faces, u, v = sampling.on_triangles(np.cumsum(areas), rng.random((2, _POINTS)))
     weights = np.stack([1 - u - v, u, v], 1)
-    some = _points(mesh, of_corner, faces, weights)
+    some = _points(mesh, faces, weights)
     one, two = yield from _traced(some, scene, order, min(pilot_rays(tolerance), _MOST_RAYS), rng, threads)
     energy = float((one * two).sum())
     if energy <= _DARK ** 2 * float(np.square(sh.cosine_lobe(some.normals, order)).sum()):
         return None
-    baked = np.einsum("nc,nck->nk", weights, coefficients[of_corner[faces]].astype(np.float64))
+    baked = np.einsum("nc,nck->nk", weights, coefficients[_of_corner(mesh, faces)].astype(np.float64))
     return Inside(_product(one - baked, two - baked, energy), energy, faces, weights, (one, two))
 
 
@@ -99,13 +98,11 @@ def said(inside: Inside, tolerance: float) -> str:
 def side(mesh: TriangleMesh, scene: Occluders, inside: Inside, order: int, tolerance: float, seed: int, threads: int
          ) -> Generator[float, None, int]:
     """The side of the texture, a power of two, that would have the shadows inside faces. Yields progress."""
-    of_corner = _of_corner(mesh)
-    assert of_corner is not None
     area, rng, errors = float(_areas(mesh).sum()), np.random.default_rng([seed, 7]), []
     for tried in _TRIALS:
         spacing = (area / _FULL) ** 0.5 / tried
         near, at, mix = around(mesh, scene, inside.faces, inside.weights, spacing, rng)
-        read = yield from _traced(_points(mesh, of_corner, near, at), scene, order, _TRIAL_RAYS, rng, threads)
+        read = yield from _traced(_points(mesh, near, at), scene, order, _TRIAL_RAYS, rng, threads)
         seen = mix.any(1)[:, None]
         off = [seen * (true - np.einsum("nc,nck->nk", mix, texels.reshape(*mix.shape, -1)))
                for true, texels in zip(inside.traced, read, strict=True)]
@@ -116,15 +113,18 @@ def side(mesh: TriangleMesh, scene: Occluders, inside: Inside, order: int, toler
     return int(2 ** round(float(np.log2(np.clip(found, *_SIDES)))))
 
 
-def _of_corner(mesh: TriangleMesh) -> NDArray | None:
-    """(F, 3) points that faces lie between, where the mesh says which."""
-    of_corner = mesh.corners if mesh.domain == CORNER else mesh.triangles
-    return None if mesh.domain == TEXEL or of_corner is None else mesh.elements[of_corner]
+def _of_corner(mesh: TriangleMesh, faces: NDArray) -> NDArray[np.int32]:
+    """(n, 3) points that faces (n,) lie between."""
+    of_corner = mesh.triangles if mesh.corners is None else mesh.corners
+    return mesh.elements[of_corner[faces]]
 
 
 def _areas(mesh: TriangleMesh) -> NDArray[np.float64]:
-    places = mesh.positions[mesh.triangles]
-    return np.linalg.norm(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]), axis=1) / 2
+    one, two, three = mesh.triangles.T
+    # axis by axis: NumPy is slow along short last ones
+    (ax, bx), (ay, by), (az, bz) = ((axis[two] - axis[one], axis[three] - axis[one])
+                                    for axis in np.ascontiguousarray(mesh.positions.T))
+    return np.sqrt((ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2) / 2
 
 
 def _traced(points: TriangleMesh, scene: Occluders, order: int, rays: int, rng: np.random.Generator, threads: int
@@ -168,11 +168,11 @@ def around(mesh: TriangleMesh, scene: Occluders, faces: NDArray, weights: NDArra
     return met, at, shares / np.maximum(shares.sum(1, keepdims=True), 1e-9)
 
 
-def _points(mesh: TriangleMesh, of_corner: NDArray, faces: NDArray, weights: NDArray) -> TriangleMesh:
-    """Points at barycentrics (n, 3) of faces (n,), as a texture has them; of_corner: (F, 3) points of the mesh."""
+def _points(mesh: TriangleMesh, faces: NDArray, weights: NDArray) -> TriangleMesh:
+    """Points at barycentrics (n, 3) of faces (n,), as a texture has them."""
     count = len(faces)
     surface = Surface(mesh.positions, mesh.triangles[faces].ravel(),
-                      mesh.normals[of_corner[faces].ravel()].astype(np.float32), np.repeat(np.arange(count), 3),
+                      mesh.normals[_of_corner(mesh, faces).ravel()].astype(np.float32), np.repeat(np.arange(count), 3),
                       np.arange(3 * count, dtype=np.int32).reshape(-1, 3), mesh.resolution)
     return texel_points(surface, Coverage(1, np.arange(count), np.arange(count, dtype=np.int32), weights, weights))
 

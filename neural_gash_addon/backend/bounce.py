@@ -183,7 +183,7 @@ class Bounces:
         sets = sampling.hemisphere_sets(_SETS, rays, int(rng.integers(2**31)))
         which, angles = rng.integers(0, _SETS, len(mesh.points)), rng.uniform(0, 2 * np.pi, len(mesh.points))
         padded = np.concatenate([self._leaving, np.zeros((1, 3 * terms), np.float32)])
-        lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+        lit = mesh.lit()
         step = max(1, _RAYS_AT_ONCE // rays)
 
         def part(points: NDArray) -> None:

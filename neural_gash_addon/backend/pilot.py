@@ -85,7 +85,7 @@ class Pilot:
 def look(mesh: TriangleMesh, scene: Occluders, order: int, tolerance: float, seed: int, pool: ThreadPoolExecutor,
          threads: int) -> Generator[float, None, Pilot]:
     """Trace a few points twice, with rays whose noise is about the tolerance. Yields progress."""
-    lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+    lit = mesh.lit()
     rng = np.random.default_rng([seed, 5])
     wanted = sample_size(len(lit))
     points = np.sort(rng.choice(lit, wanted, replace=False))

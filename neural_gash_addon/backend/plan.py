@@ -59,10 +59,10 @@ def nothing_blocks(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> bool:
     """
     parts = [(mesh.positions, mesh.triangles), *((p, t) for p, t in occluders if len(t))]
     vertices = np.concatenate([np.asarray(p, np.float64)[used(p, t)] for p, t in parts])
-    lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+    lit = mesh.lit()
     points, normals = mesh.points[lit], mesh.normals[lit]
     # a handful first: almost every mesh is found out by them
-    level = _LEVEL * float(np.ptp(vertices, axis=0).max())
+    level = _LEVEL * max(float(np.ptp(axis)) for axis in vertices.T)
     some, few = points[::len(points) // 32 + 1], vertices[::len(vertices) // 4096 + 1]
     height = normals[::len(points) // 32 + 1]
     if (product(height, few.T).max(1, initial=-np.inf) > (height * some).sum(1) + level).any():
