@@ -68,7 +68,8 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
         assert scene is not None
         asking = advice.inside_faces(seen, scene, corners, order, tolerance, seed, threads or default_threads())
         inside = yield from scaled(asking, 1, 0)
-        record = record.also(advice.said(inside, tolerance) if inside else "")
+        if inside is not None:
+            record = replace(record, between_error=inside).also(advice.said(inside, tolerance))
     if pilot is not None:
         probes += pilot.traced
     return Transfer(transfer.coefficients, replace(record, probe_rays=probes, seconds=time.perf_counter() - began,
