@@ -85,7 +85,7 @@ METHODS: dict[str, Method] = {m.name: m for m in (
            "from them what blocks the light anywhere; what a point costs does not grow with the scene", traces=False,
            bake=sky_bake.bake, sees=sky_bake.encoded),
     Method("gnn-paper", "Paper's network (PyTorch)", "The two-stage graph network of Neural-GASh, for comparison: "
-           "shadows of what is near along the surface", traces=False, bake=paper_bake.bake_gnn),
+           "no rays; soft shadows of the mesh on itself", traces=False, bake=paper_bake.bake_gnn),
     Method("gnn-paper-ao", "Paper's network with AO (PyTorch)", "The same, darkened where neighbours stand above the "
            "surface", traces=False, bake=paper_bake.bake_gnn_ao),
     Method("mlp", "Paper's perceptron (PyTorch)", "The first version of Neural-GASh, for comparison: each point by "
