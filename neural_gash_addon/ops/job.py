@@ -94,7 +94,7 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
     mode = occluder_mode(obj, settings, group) if method.sees else SELF
     quality = settings.tracing()
     reflection = None
-    if method.traces and settings.bounces:
+    if method.bounces and settings.bounces:
         if settings.target != TEXTURE:
             check_attributes(settings.order)
         reflection = read_reflection(obj, mode, depsgraph, settings.bounces)
