@@ -100,7 +100,7 @@ def some(mesh: TriangleMesh, count: int, seed: int) -> TriangleMesh:
 
 def solved(scene: Scene, occluders: Occluders, seed: int) -> Bounces:
     """Its bounces, on one thread."""
-    found = Bounces(scene.parts, scene.albedo, occluders, sh.MAX_ORDER, seed, 1)
+    found = Bounces(scene.parts, scene.albedo, occluders, sh.MAX_ORDER, seed, 1, PATCHES)
     run(found.solve(scene.bounces))
     return found
 
