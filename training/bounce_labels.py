@@ -62,10 +62,14 @@ class Outcome(NamedTuple):
 
 
 def scene_of(path: Path) -> Scene:
-    """The scene of a labelled mesh, drawn by its name."""
+    """The scene of a labelled mesh."""
     found = labels.load(path)
-    rng = np.random.default_rng(list(hashlib.sha256(f"{VERSION}:{found.name}".encode()).digest()[:8]))
-    mesh = TriangleMesh.from_triangles(found.positions, found.triangles)
+    return dressed(TriangleMesh.from_triangles(found.positions, found.triangles), found.name)
+
+
+def dressed(mesh: TriangleMesh, name: str) -> Scene:
+    """A mesh, its box about the origin and its longest side 1, in colours and surroundings drawn by its name."""
+    rng = np.random.default_rng(list(hashlib.sha256(f"{VERSION}:{name}".encode()).digest()[:8]))
     centres = mesh.positions[mesh.triangles].mean(1)
     cells = rng.uniform(-0.5, 0.5, (rng.integers(1, 7), 3))
     colours = np.stack([colour(rng) for _ in cells])
