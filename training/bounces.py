@@ -28,7 +28,7 @@ from .bounce_labels import ARRAYS, jobs
 from .curves import draw
 
 NAME = "bounces"
-STEPS, RATE, EVERY = 2_000, 2e-3, 100
+STEPS, RATE, EVERY = 2_500, 2e-3, 100
 ROWS = 1024          # queries of a step
 FLOOR = 1e-6         # of a query's energy, so that a scene where nothing bounces does not decide
 TERMS = 9            # that are judged; the others count in the loss by a third

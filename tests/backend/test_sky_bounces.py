@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Light that bounces, by the embedding: a closed form, what holds by construction, and what was learned."""
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 torch = pytest.importorskip("torch")
 
-from neural_gash_addon.backend import methods, sky_bake, weights  # noqa: E402
+from neural_gash_addon.backend import bounce, methods, sky_bake, weights  # noqa: E402
 from neural_gash_addon.backend import spherical_harmonics as sh  # noqa: E402
 from neural_gash_addon.backend.bounce import BLACK, Bounces, Reflection  # noqa: E402
 from neural_gash_addon.backend.errors import UserError  # noqa: E402
@@ -48,7 +50,9 @@ class Given:
 
 @pytest.fixture
 def anything(monkeypatch):
-    """Any networks as those that ship."""
+    """Any networks as those that ship, few patches and scene points: what is asked does not hang on their number."""
+    monkeypatch.setattr(sky_bake, "POINTS", 512)
+    monkeypatch.setattr(bounce, "Bounces", partial(Bounces, budget=1000))
     monkeypatch.setattr(sky_bake, "network", any_sky)
     monkeypatch.setattr(sky_bake, "reflecting", any_decoder)
 
@@ -83,7 +87,7 @@ def corner():
     return mesh, around, reflection(mesh, around, colours=[(0.1, 0.8, 0.1), (0.9, 0.1, 0.1)])
 
 
-def open_sphere(angle=1.0, rows=40, columns=80):
+def open_sphere(angle=1.0, rows=20, columns=40):
     """The inside of a unit sphere without its cap about +z, and the share of the light that a bounce keeps."""
     polar, around = np.linspace(angle, np.pi, rows + 1), np.arange(columns) * 2 * np.pi / columns
     polar, around = (each.ravel() for each in np.meshgrid(polar, around, indexing="ij"))
@@ -106,19 +110,19 @@ def in_the_open_sphere(order, number, angle=1.0):
     return sky[:, None] * sum(ALBEDO ** b * closed ** (b - 1) for b in range(1, number + 1))
 
 
-@pytest.mark.parametrize("number", [1, 2, 40])
+@pytest.mark.parametrize("number", [1, 2, 10])
 def test_an_integrating_sphere_is_the_closed_form(number):
     mesh, _ = open_sphere()
     expected = in_the_open_sphere(3, number)
     inside = mesh.points[:, 2] < 0.5  # not at the rim, where patches end
-    parts = [(mesh.positions, mesh.triangles)]
-    traced = Bounces(parts, reflection(mesh).albedo, Occluders(parts, mesh.resolution), 3)
-    run(traced.solve(number, tolerance=0))
-    found = run(traced.gather(mesh, 256))[inside]
+    parts, light = [(mesh.positions, mesh.triangles)], reflection(mesh)
+    light.solution = Bounces(parts, light.albedo, Occluders(parts, mesh.resolution), 3, budget=2000)
+    run(light.solution.solve(number, tolerance=0))
+    found = run(light.solution.gather(mesh, 256))[inside]
     assert np.linalg.norm(found.mean(0) - expected) < 0.02 * np.linalg.norm(expected)
-    both = bake(mesh, reflection=reflection(mesh, number=number))
+    both = bake(mesh, reflection=light)
     learned = (both.coefficients - bake(mesh).coefficients[:, :, None])[inside]
-    assert both.record.bounces == (number if number < 3 else both.record.bounces) and both.record.colours == 3
+    assert both.record.bounces == number and both.record.colours == 3
     assert np.linalg.norm(learned.mean(0) - expected) < 0.03 * np.linalg.norm(expected)
     off = np.linalg.norm(learned - expected, axis=(1, 2)) / np.linalg.norm(expected)
     assert np.sqrt(np.square(off).mean()) < 0.08
@@ -173,7 +177,7 @@ def test_a_bake_is_the_same_in_any_order_in_chunks_on_any_threads_and_in_tiles(a
     mesh, around, light = corner()
     whole = bake(mesh, reflection=light, occluders=around, threads=1)
     assert whole.coefficients.shape == (len(mesh.points), 9, 3)
-    assert whole.record.rays == 2 * 4096 * 64 and whole.record.bounces == light.solution.used > 0
+    assert whole.record.rays == 2 * 512 * 64 and whole.record.bounces == light.solution.used > 0
     again = bake(mesh, reflection=corner()[2], occluders=around, threads=2)
     np.testing.assert_allclose(again.coefficients, whole.coefficients, atol=1e-5)
     monkeypatch.setattr(sky_bake, "QUERIES_AT_ONCE", 50)
@@ -191,18 +195,21 @@ def test_a_bake_is_the_same_in_any_order_in_chunks_on_any_threads_and_in_tiles(a
 
 def test_what_ships_is_near_and_knows_how_far_off_it_is():
     mesh, around, light = corner()
-    truth, other = (bake(mesh, method="embree", rays=1024, occluders=around, seed=seed, reflection=Reflection(
-        light.albedo, light.bounces, seed=seed)) for seed in (8, 9))
+    parts = [(mesh.positions, mesh.triangles), *around]
+    scene, both = Occluders(parts, mesh.resolution), []
+    for seed in (8, 9):
+        solution = Bounces(parts, light.albedo, scene, 3, seed, budget=4000)
+        run(solution.solve())
+        both.append(run(solution.gather(mesh, 1024)))
+    one, two = both
     direct = bake(mesh, method="embree", rays=4096, occluders=around, seed=7).coefficients[:, :, None]
     found = bake(mesh, occluders=around, reflection=light)
     learned = found.coefficients - bake(mesh, occluders=around).coefficients[:, :, None]
-    one, two = truth.coefficients - direct, other.coefficients - direct
     assert ((learned - one) * (learned - two)).sum() < 0.06 ** 2 * (one * two).sum()
     assert one[:, 0].mean(0)[1] > 1.2 * one[:, 0].mean(0)[2]  # it is in colour
-    error = np.linalg.norm(found.coefficients - truth.coefficients) / np.linalg.norm(truth.coefficients)
+    truth = direct + (one + two) / 2
+    error = np.linalg.norm(found.coefficients - truth) / np.linalg.norm(truth)
     assert 0.5 < found.record.error_estimate / error < 1.6
-    higher = bake(mesh, 5, occluders=around, reflection=corner()[2]).coefficients
-    np.testing.assert_allclose(higher[:, :9], found.coefficients, atol=2e-3)
 
 
 def test_more_bounces_are_more_light(anything):
