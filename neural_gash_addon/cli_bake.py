@@ -43,8 +43,11 @@ def check_bake(arguments: argparse.Namespace) -> None:
         raise UserError("With --uv-map a texture has no texels per metre; give --texture a number of texels, or fit.")
     if arguments.gloss and (arguments.texture is None or arguments.bounces):
         raise UserError("--gloss belongs to a bake with --texture and without --bounces.")
-    if not methods.METHODS[arguments.method].traces and (arguments.rays is not None or arguments.bounces):
-        raise UserError(f"The method '{arguments.method}' traces nothing; leave out --rays and --bounces.")
+    method = methods.METHODS[arguments.method]
+    if arguments.rays is not None and not method.traces:
+        raise UserError(f"The method '{arguments.method}' takes no number of rays; leave out --rays.")
+    if arguments.bounces and not method.bounces:
+        raise UserError(f"The method '{arguments.method}' follows no light that bounces; leave out --bounces.")
     if arguments.texture is not None and arguments.npz is not None:
         raise UserError("--npz holds the points of a bake to vertices; a texture's are in its .exr files (--textures).")
 

@@ -117,7 +117,7 @@ def _prepared(context: bpy.types.Context, obj: bpy.types.Object, settings: Neura
     method = methods.METHODS[settings.method]
     quality = settings.tracing()
     reflection = None
-    if method.traces and settings.bounces:
+    if method.bounces and settings.bounces:
         if not to_texture:
             check_attributes(settings.order)
         reflection = read_reflection(obj, mode, depsgraph, settings.bounces)
