@@ -294,7 +294,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
                 solution = None
         colours = () if solution is None else (3,)
         coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order), *colours), np.float32)
-        lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+        lit = mesh.lit()
         lit = lit[morton_order(mesh.points[lit])] if len(lit) else lit
         for start in range(0, len(lit), QUERIES_AT_ONCE):
             rows = lit[start:start + QUERIES_AT_ONCE]
