@@ -64,6 +64,9 @@ def _parser() -> argparse.ArgumentParser:
     bake.add_argument("--texture", type=_side, metavar="SIDE",
                       help="bake to a texture of SIDE x SIDE texels instead; '50/m': so many texels a metre; 'fit': as "
                            "large as the tolerance needs (0.02 with --rays)")
+    bake.add_argument("--target", choices=["auto", "vertices"], help="where the bake is kept without --texture: auto, "
+                      "the default, at the vertices, or where these miss shadow edges inside faces, in a texture as "
+                      "large as the tolerance asks for; at the vertices with --npz, --rays or another method than auto")
     bake.add_argument("--padding", type=int, metavar="TEXELS", help="around each part of the UV map of --texture (2)")
     bake.add_argument("--share", action="store_true", help="one texture for all objects, with --texture")
     bake.add_argument("--uv-map", metavar="NAME", default="", help="of the mesh, for --texture; else one is made")

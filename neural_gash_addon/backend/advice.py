@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ _POINTS = 96
 _MOST_RAYS = 32       # of each trace of them,
 _TRIAL_RAYS = 16      # and of each texel's: four of them are averaged
 _OWN_NOISE = 1.25     # of the tolerance: what corners that just keep to it may differ by inside faces that hold no edge
+_CORNER_RAYS = 16     # of each corner's, of which three are averaged
 _TRIALS = 128, 512    # texels a side of the textures that are tried
 _LEAST_RATE, _MOST_RATE = 0.5, 2.0  # powers of the side by which an error falls: at a shadow's edge, where smooth
 _FULL = 0.6           # of a texture that its charts cover, about
@@ -50,18 +52,20 @@ class Inside(NamedTuple):
     """What n points inside faces say."""
 
     error: float      # of what corners say between them, relative L2, without the noise of these rays
+    noise: float      # of the tolerance: what the corners' own may add to that
     energy: float     # squares of transfer, summed
     faces: NDArray[np.int64]     # (n,) in which they lie, and
     weights: NDArray[np.float64]  # (n, 3) where
     traced: Traced    # (n, K) transfer, twice
 
 
-def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray, order: int, tolerance: float,
+def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray | None, order: int, tolerance: float,
                  seed: int, threads: int) -> Generator[float, None, Inside | None]:
     """Look whether shadows inside faces follow their corners.
 
     Args:
-        coefficients: (N, K) of the points of the mesh. scene: what blocks, the mesh first.
+        coefficients: (N, K) of the points of the mesh; None: not known yet, so corners are traced as well.
+        scene: what blocks, the mesh first.
     Yields:
         Progress.
     Returns:
@@ -78,20 +82,28 @@ def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray, or
     energy = float((one * two).sum())
     if energy <= _DARK ** 2 * float(np.square(sh.cosine_lobe(some.normals, order)).sum()):
         return None
-    baked = np.einsum("nc,nck->nk", weights, coefficients[_of_corner(mesh, faces)].astype(np.float64))
-    return Inside(_product(one - baked, two - baked, energy), energy, faces, weights, (one, two))
+    between = _of_corner(mesh, faces)
+    if coefficients is None:
+        used, between = np.unique(between, return_inverse=True)
+        few = replace(mesh, points=mesh.points[used], normals=mesh.normals[used], clearance=mesh.clearance[used])
+        corners = yield from _traced(few, scene, order, _CORNER_RAYS, rng, threads)
+        between, noise = between.reshape(len(faces), 3), 1.0
+    else:
+        corners, noise = (coefficients, coefficients), _OWN_NOISE
+    off = [true - np.einsum("nc,nck->nk", weights, at[between].astype(np.float64))
+           for true, at in zip((one, two), corners, strict=True)]
+    return Inside(_product(off[0], off[1], energy), noise, energy, faces, weights, (one, two))
 
 
 def missed(inside: Inside, tolerance: float) -> bool:
     """Whether shadows inside faces are missed by their corners."""
-    return inside.error > _OWN_NOISE * tolerance
+    return inside.error > inside.noise * tolerance
 
 
-def said(inside: Inside, tolerance: float) -> str:
-    """One sentence of it."""
+def said(inside: Inside, tolerance: float, texture: str = "a texture would have them") -> str:
+    """One sentence of it; texture: what of one, where corners miss."""
     if missed(inside, tolerance):
-        return f"Shadow edges inside faces are missed by their corners ({100 * inside.error:.0f} %): a texture would " \
-               "have them."
+        return f"Shadow edges inside faces are missed by their corners ({100 * inside.error:.0f} %): {texture}."
     return f"Shadows inside faces follow their corners to {max(100 * inside.error, 1):.0f} %: vertices are enough."
 
 

@@ -96,7 +96,7 @@ METHODS: dict[str, Method] = {m.name: m for m in (
 def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: int | None = None,
          tolerance: float | None = None, occluders: Sequence[Geometry] = (), seed: int = 0,
          threads: int | None = None, scene: Any = None, reflection: Reflection | None = None,
-         lamps: Lamps | None = None, whole: bool = False) -> Baking:
+         lamps: Lamps | None = None, whole: bool = False, movable: bool = False) -> Baking:
     """Bake the transfer of a mesh's points.
 
     Args:
@@ -112,6 +112,7 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
         lamps: what lights the points besides, if anything shall.
         seed: independent seeds give independent errors. threads: one a core where not given.
         whole: all bands, whatever a plan says: for what must be alike in several bakes.
+        movable: a method that `plans` may raise `auto_bake.Elsewhere` instead, where a texture is wanted.
     Yields:
         Progress, 0 to 1, many times a second. `close()` stops the workers.
     Returns:
@@ -122,7 +123,7 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
     check(method, order, rays, tolerance)
     entry = METHODS[method]
     direct = partial(entry.bake, mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed,
-                     threads=threads, **({"whole": whole} if entry.plans else {}))
+                     threads=threads, **({"whole": whole, "movable": movable} if entry.plans else {}))
     if reflection is None or not entry.traces:
         baking = direct(scene=scene)
     else:

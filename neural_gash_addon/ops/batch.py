@@ -12,12 +12,13 @@ import bpy
 
 from ..backend import methods
 from ..backend.atlas import Placed, place
+from ..backend.auto_bake import Elsewhere
 from ..backend.errors import UserError
 from ..backend.progress import scaled
 from ..backend.record import BakeRecord
 from ..backend.texture import TextureTransfer, alike, merged
 from ..backend.transfer import Transfer
-from ..properties import TEXTURE, NeuralGashSettings
+from ..properties import NeuralGashSettings
 from ..scene.images import make_images, remove_unused
 from ..scene.lamps import LitScenes
 from .job import Job, check, finish, prepare, size
@@ -42,8 +43,13 @@ class Batch:
 
     jobs: list[Job]
     refused: list[Outcome]
-    shared: bool  # one texture for all
+    share: bool   # one texture for all
     baking: Generator[float, None, list[Result]]
+
+    @property
+    def shared(self) -> bool:
+        """Whether several have one texture."""
+        return self.share and sum(job.texture is not None for job in self.jobs) > 1
 
     @property
     def names(self) -> list[str]:
@@ -80,31 +86,47 @@ def prepare_batch(context: bpy.types.Context, objects: Sequence[bpy.types.Object
         meshes[obj.data.session_uid] = obj.name
     if not jobs:
         raise UserError(refused[0].sentence)
-    shared = settings.target == TEXTURE and settings.share and len(jobs) > 1
-    return Batch(jobs, refused, shared, _bake(jobs, shared, size(settings)))
+    return Batch(jobs, refused, settings.share, _bake(jobs, settings.share, size(settings), settings.tolerance))
 
 
-def _bake(jobs: list[Job], shared: bool, sizes: dict) -> Generator[float, None, list[Result]]:
-    """The arrays of all jobs, one after another; never touches bpy."""
-    results: list[Result] = []
+def _bake(jobs: list[Job], share: bool, sizes: dict, tolerance: float) -> Generator[float, None, list[Result]]:
+    """The arrays of all jobs, one after another; never touches bpy. Jobs that move to a texture are replaced."""
+    results: dict[int, Result] = {}
+    why: dict[int, Callable[[int], str]] = {}
     done = 0.0
-    if shared:
-        began = time.perf_counter()
-        placing = place([job.texture.part for job in jobs if job.texture], **sizes)
-        places, side = yield from scaled(placing, 0, _PLACING)
-        done, spent = _PLACING, (time.perf_counter() - began) / len(jobs)
-        bakes = [_placed(job, placed, side, spent) for job, placed in zip(jobs, places, strict=True)]
-    else:
-        bakes = [job.bake() if job.texture is None else _textured(job, sizes) for job in jobs]
-    for number, bake in enumerate(bakes):
-        share = (1 - done) / len(jobs)
+
+    def baked(number: int, bake: Generator[float, None, Transfer | TextureTransfer], part: float
+              ) -> Generator[float, None, None]:
+        nonlocal done
         try:
-            results.append((yield from scaled(bake, done + number * share, share)))
+            results[number] = yield from scaled(bake, done, part)
+            done += part
+        except Elsewhere as wanted:
+            jobs[number], why[number] = jobs[number].moved(wanted, tolerance)
         except UserError as error:
             if len(jobs) == 1:
                 raise
-            results.append(error)
-    return results
+            results[number] = error
+
+    for number, job in enumerate(jobs):
+        if job.texture is None:
+            yield from baked(number, job.bake(), 1 / len(jobs))
+    textured = {number: job for number, job in enumerate(jobs) if number not in results}
+    if share and len(textured) > 1:
+        began, part = time.perf_counter(), _PLACING * (1 - done)
+        placing = place([job.texture.part for job in textured.values() if job.texture], **sizes)
+        places, side = yield from scaled(placing, done, part)
+        done, spent = done + part, (time.perf_counter() - began) / len(textured)
+        bakes = [_placed(job, placed, side, spent) for job, placed in zip(textured.values(), places, strict=True)]
+    else:
+        bakes = [_textured(job, sizes) for job in textured.values()]
+    part = (1 - done) / max(len(textured), 1)
+    for number, bake in zip(textured, bakes, strict=True):
+        yield from baked(number, bake, part)
+        found = results[number]
+        if number in why and isinstance(found, TextureTransfer):
+            results[number] = replace(found, record=found.record.also(why[number](found.record.side)))
+    return [results[number] for number in range(len(jobs))]
 
 
 def _textured(job: Job, sizes: dict) -> Generator[float, None, Transfer | TextureTransfer]:
@@ -141,19 +163,21 @@ def finish_batch(context: bpy.types.Context, batch: Batch, results: Sequence[Res
             if job.lamps is not None and lit.of(check(context, job))[1] != job.lamps.key:
                 raise UserError(f"The lamps of '{job.name}', or what they light, were changed during the bake; bake "
                                 "again.")
-            if batch.shared:
+            if batch.shared and job.texture is not None:
                 owners.append(check(context, job).data)
             baked.append((job, result))
         except UserError as error:
             outcomes.append(Outcome(job.name, None, _named(job, error, len(batch.jobs) + len(batch.refused))))
     images: list[bpy.types.Image] = []
-    if batch.shared and baked:
-        whole = alike([t for _, t in baked if isinstance(t, TextureTransfer)])
-        baked = [(job, part) for (job, _), part in zip(baked, whole, strict=True)]
-        options = baked[0][0].texture
+    whole = alike([t for _, t in baked if isinstance(t, TextureTransfer)]) if batch.shared else []
+    if whole:
+        parts = iter(whole)
+        baked = [(job, t if job.texture is None else next(parts)) for job, t in baked]
+        of = [job for job, _ in baked if job.texture is not None]
+        options = of[0].texture
         assert options is not None
-        records = {job.name: {"frame": job.frame, "uv_map": options.uv_map} for job, _ in baked}
-        images = make_images(baked[0][0].name, merged(whole), options.folder, options.half, json.dumps(records),
+        records = {job.name: {"frame": job.frame, "uv_map": options.uv_map} for job in of}
+        images = make_images(of[0].name, merged(whole), options.folder, options.half, json.dumps(records),
                              owners=owners)
     for job, transfer in baked:
         try:
