@@ -61,7 +61,6 @@ def _line(name: str, frames: np.ndarray, faces: np.ndarray, budget: int, runs: i
     try:
         obj = _object(frames, faces, folder / "clip.pc2")
         scene = bpy.context.scene
-        scene.neural_gash.target = "VERTICES"
         bpy.ops.neural_gash.bake()
         found = []
         for _ in range(runs):

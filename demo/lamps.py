@@ -139,7 +139,6 @@ def main() -> None:
     objects = build()
     settings = bpy.context.scene.neural_gash
     settings.lamps, settings.occluders, settings.tolerance = True, "VISIBLE", arguments.tolerance
-    settings.target = "VERTICES"
     with silent_blender():
         bpy.ops.neural_gash.bake()
         preview = render_pixels(objects, camera=bpy.context.scene.camera, resolution=RESOLUTION, samples=64)

@@ -17,7 +17,7 @@ from .backend.transfer import Transfer
 from .cli_files import choose, save_file, set_number
 from .ops.batch import Batch, Outcome, finish_batch, prepare_batch
 from .properties import (
-    AUTO,
+    AUTOMATIC,
     CHEAPEST,
     COLLECTION,
     DENSITY,
@@ -36,27 +36,20 @@ from .scene.views import LIT
 
 def check_bake(arguments: argparse.Namespace) -> None:
     """UserError where arguments of `bake` do not go together."""
-    if arguments.target is not None and arguments.texture is not None:
-        raise UserError(f"--texture and --target {arguments.target} contradict each other; leave one out.")
-    choice = arguments.uv_map or arguments.half or arguments.share or arguments.padding is not None
-    if arguments.texture is None and (arguments.textures or (choice and arguments.target != "auto")):
-        raise UserError("--uv-map, --textures, --padding, --half and --share belong to a bake with --texture; "
-                        "all but --textures to one with --target auto, too.")
-    if arguments.uv_map and arguments.texture is not None and arguments.texture[0] == DENSITY:
+    if arguments.texture is None and (arguments.uv_map or arguments.textures or arguments.half or arguments.share
+                                      or arguments.padding is not None):
+        raise UserError("--uv-map, --textures, --padding, --half and --share belong to a bake with --texture.")
+    if arguments.uv_map and arguments.texture[0] == DENSITY:
         raise UserError("With --uv-map a texture has no texels per metre; give --texture a number of texels, or fit.")
     if arguments.gloss and (arguments.texture is None or arguments.bounces):
         raise UserError("--gloss belongs to a bake with --texture and without --bounces.")
-    if not methods.METHODS[arguments.method].traces and (arguments.rays is not None or arguments.bounces):
-        raise UserError(f"The method '{arguments.method}' traces nothing; leave out --rays and --bounces.")
+    method = methods.METHODS[arguments.method]
+    if arguments.rays is not None and not method.traces:
+        raise UserError(f"The method '{arguments.method}' takes no number of rays; leave out --rays.")
+    if arguments.bounces and not method.bounces:
+        raise UserError(f"The method '{arguments.method}' follows no light that bounces; leave out --bounces.")
     if arguments.texture is not None and arguments.npz is not None:
         raise UserError("--npz holds the points of a bake to vertices; a texture's are in its .exr files (--textures).")
-
-
-def target(arguments: argparse.Namespace) -> str:
-    """Where a bake is to be kept, as the settings have it."""
-    if arguments.texture is not None:
-        return TEXTURE
-    return VERTICES if arguments.target == "vertices" or arguments.npz is not None else AUTO
 
 
 def choose_meshes(names: Sequence[str] | None) -> list[bpy.types.Object]:
@@ -90,15 +83,16 @@ def prepare_bake(arguments: argparse.Namespace, objects: list[bpy.types.Object],
     set_number(settings, "bounces", arguments.bounces)
     settings.lamps = arguments.lamps or arguments.lamps_network
     settings.lamps_by = NETWORK if arguments.lamps_network else CHEAPEST
-    settings.target = target(arguments)
     if arguments.texture is not None:
-        settings.sizing, size = arguments.texture
+        sizing, size = arguments.texture
+        settings.target, settings.sizing = (AUTOMATIC, FIT) if sizing == AUTOMATIC else (TEXTURE, sizing)
         if settings.sizing != FIT:
             set_number(settings, "side" if settings.sizing == RESOLUTION else "texels_per_metre", size)
-    if settings.target != VERTICES:
         set_number(settings, "padding", 2 if arguments.padding is None else arguments.padding)
         settings.share, settings.uv_map, settings.half = arguments.share, arguments.uv_map, arguments.half
         settings.texture_folder = str(arguments.textures.absolute()) if arguments.textures else ""
+    else:
+        settings.target = VERTICES
     settings.view = LIT
     if arguments.gloss:
         settings.gloss, settings.lobe = True, arguments.gloss.upper()
@@ -137,7 +131,7 @@ def finish_bake(arguments: argparse.Namespace, objects: Sequence[bpy.types.Objec
 def _tiles(arguments: argparse.Namespace, obj: bpy.types.Object) -> Path | None:
     """Beside the first output: finished tiles of a large texture, from which a killed bake goes on."""
     output = next((p for p in (arguments.textures, arguments.out, arguments.npz, arguments.png) if p is not None), None)
-    if target(arguments) == VERTICES or output is None:
+    if arguments.texture is None or output is None:
         return None
     return output.absolute().parent / f".{output.stem}-{clean_name(obj.name)}.tiles"
 

@@ -19,10 +19,9 @@ import bpy
 
 from .backend import exchange
 from .backend.errors import UserError
-from .cli_bake import choose_meshes, clean_name, finish_bake, prepare_bake, target
+from .cli_bake import choose_meshes, clean_name, finish_bake, prepare_bake
 from .cli_files import open_file, sentence
 from .ops.job import Job
-from .properties import VERTICES
 from .scene.read import same_fingerprint
 
 _OUTPUTS = ("npz", "textures", "png", "out")
@@ -166,7 +165,7 @@ def _bake(arguments: argparse.Namespace, item: Item, entry: dict, progress: Call
         if path != own.textures:
             exchange.check_writable(path)
     # What a bake leaves in the file must not be in the next one's outputs; attributes are replaced by the next.
-    changes = any((own.out, own.png, target(own) != VERTICES, own.applied_copy))
+    changes = any((own.out, own.png, own.texture, own.applied_copy))
     objects, batch = prepare_bake(own, [chosen])
     key = _key(own, batch.jobs[0], item)
     state = outputs[0].with_name(outputs[0].name + ".json")

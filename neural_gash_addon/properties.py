@@ -29,7 +29,7 @@ from .scene.viewport import follow_viewport
 from .scene.views import COEFFICIENT, LIT, OCCLUSION
 
 RAYS, TOLERANCE, COLLECTION = "RAYS", "TOLERANCE", "COLLECTION"
-AUTO, VERTICES, TEXTURE = "AUTO", "VERTICES", "TEXTURE"
+AUTOMATIC, VERTICES, TEXTURE = "AUTOMATIC", "VERTICES", "TEXTURE"
 CHEAPEST, PATHS, NETWORK = "CHEAPEST", "PATHS", "NETWORK"
 RESOLUTION, DENSITY, FIT = "RESOLUTION", "DENSITY", "FIT"
 
@@ -123,10 +123,9 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
                (NETWORK, "Network (PyTorch)", "Direct light is traced; what surfaces reflect is traced at some "
                 "thousand points, and a network says from them what it is anywhere. For rooms of up to 20 m")])
     target: EnumProperty(  # type: ignore[valid-type]
-        name="Target", description="Where the bake is kept", default=AUTO,
-        items=[(AUTO, "Automatic", "At the vertices, or where these miss shadow edges inside faces, in a texture as "
-                "large as the tolerance asks for. With another method or a number of rays, for sequences and while "
-                "Live is on: at the vertices"),
+        name="Target", description="Where the bake is kept", default=VERTICES,
+        items=[(AUTOMATIC, "Automatic", "Vertices; where the method is Automatic, too, and vertices would miss shadows "
+                "inside faces by more than the tolerance, a texture as large as these need"),
                (VERTICES, "Vertices", "Numbers at the vertices: quick, and enough for dense meshes"),
                (TEXTURE, "Texture", "Images with a UV map of their own: fine shadows on large faces, and normal maps")])
     sizing: EnumProperty(  # type: ignore[valid-type]
@@ -224,24 +223,6 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
         if not METHODS[self.method].traces:
             return {}
         return {"rays": self.rays} if self.quality == RAYS else {"tolerance": self.tolerance}
-
-    def undecided(self) -> bool:
-        """Whether the planner chooses where the bake is kept."""
-        return self.target == AUTO and not self.target_note()
-
-    def target_note(self) -> str:
-        """Why the target Automatic means vertices, whatever the mesh; '' where it does not, or is not chosen."""
-        if self.target != AUTO:
-            return ""
-        if not METHODS[self.method].plans:
-            return "Vertices, as only the method Automatic chooses a target."
-        if self.quality == RAYS:
-            return "Vertices, as there is no tolerance to choose a target by."
-        return "Vertices, as Live is on, and follows no textures." if self.live else ""
-
-    def fits(self) -> bool:
-        """Whether the error decides how large a texture is."""
-        return self.target == AUTO or self.sizing == FIT
 
     def lobe_shown(self) -> str:
         """The lobe of glossy previews; '' where they are dull."""

@@ -11,7 +11,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from . import advice
 from . import spherical_harmonics as sh
@@ -30,14 +29,6 @@ _ROUGH = 0.05    # a tolerance that a look at a merged mesh is exact enough for
 _MANY = 1 << 18  # points that are baked at a time, where those that are looked at are but some of them
 
 
-class Elsewhere(Exception):
-    """The bake should be to a texture instead."""
-
-    def __init__(self, inside: advice.Inside, side: int) -> None:
-        super().__init__()
-        self.inside, self.side = inside, side  # why, and about how large
-
-
 @dataclass(frozen=True, eq=False)
 class Planned:
     """What is to be run, and what is there for it already."""
@@ -50,43 +41,18 @@ class Planned:
 
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None, occluders: Sequence[Geometry],
-         seed: int, threads: int | None, scene: Occluders | None = None, whole: bool = False, movable: bool = False,
+         seed: int, threads: int | None, scene: Occluders | None = None, whole: bool = False,
          bakers: Mapping[str, Callable[..., Generator[float, None, Transfer]]],
          ) -> Generator[float, None, Transfer]:
     """Bake as cheaply as the tolerance allows; arguments as `methods.bake`.
 
     bakers: the methods that a plan may name. With a number of rays there is nothing to plan but whether any is needed.
-
-    Raises:
-        Elsewhere: the bake is movable, and corners miss what is inside faces; raised before they are baked.
     """
     began = time.perf_counter()
     planning = planned(mesh, order, rays, tolerance, occluders, seed, threads, scene, whole)
     found = yield from scaled(planning, 0, _PILOT_SHARE)
     plan, pilot, order = found.plan, found.pilot, found.bands.order
     known = {"pilot": pilot} if plan.method != "analytic" else {}
-    inside: advice.Inside | None = None
-
-    def looked(coefficients: NDArray | None) -> Generator[float, None, advice.Inside | None]:
-        """Look inside faces; before the bake, which may be another then, or after it."""
-        assert tolerance is not None
-        seen, scene = mesh, found.scene
-        if found.merged:
-            seen, scene = found.merged.surface(), found.merged.scene
-        if plan.method == "analytic":
-            coefficients = sh.cosine_lobe(seen.normals, order).astype(np.float32)
-        assert scene is not None
-        beside = threads or default_threads()
-        looking = advice.inside_faces(seen, scene, coefficients, order, tolerance, seed, beside)
-        inside = yield from scaled(looking, _PILOT_SHARE if coefficients is None else 1, 0)
-        if movable and inside is not None and advice.missed(inside, tolerance):
-            sizing = advice.side(seen, scene, inside, order, tolerance, seed, beside)
-            raise Elsewhere(inside, (yield from scaled(sizing, _PILOT_SHARE, 0)))
-        return inside
-
-    plans = pilot is not None and tolerance is not None
-    if plans and movable:
-        inside = yield from looked(None)
     work = bakers[plan.method](mesh, order, rays=plan.rays, tolerance=plan.tolerance, occluders=occluders, seed=seed,
                                threads=threads, scene=found.scene, **known)
     transfer = yield from scaled(work, _PILOT_SHARE, 1 - _PILOT_SHARE)
@@ -94,10 +60,16 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     error, probes = record.error_estimate, record.probe_rays
     if plan.method == "analytic":
         error = pilot.blocked if pilot is not None else 0.0
-    if plans and not movable:
-        inside = yield from looked(transfer.coefficients)
-    if inside is not None and tolerance is not None:
-        record = record.also(advice.said(inside, tolerance))
+    if pilot is not None and tolerance is not None:
+        seen, scene, corners = mesh, found.scene, transfer.coefficients
+        if found.merged:
+            seen, scene = found.merged.surface(), found.merged.scene
+            corners = sh.cosine_lobe(seen.normals, order).astype(np.float32)
+        assert scene is not None
+        asking = advice.inside_faces(seen, scene, corners, order, tolerance, seed, threads or default_threads())
+        inside = yield from scaled(asking, 1, 0)
+        if inside is not None:
+            record = replace(record, between_error=inside).also(advice.said(inside, tolerance))
     if pilot is not None:
         probes += pilot.traced
     return Transfer(transfer.coefficients, replace(record, probe_rays=probes, seconds=time.perf_counter() - began,

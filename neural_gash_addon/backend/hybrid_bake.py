@@ -57,7 +57,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     threads = threads or default_threads()
     if scene is None:
         scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
-    lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+    lit = mesh.lit()
     network = load_hybrid() if len(lit) >= FEWEST else None
     last = MAX_RAYS if rays is None else rays if network else max(rays, min(2 * rays, MOST_DOUBLED))
     coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
@@ -110,7 +110,7 @@ def at_once(mesh: TriangleMesh, occluders: Sequence[Geometry], order: int, rays:
     coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
     threads = default_threads()
     with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
-        lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+        lit = mesh.lit()
         if len(lit):
             work = _Work(mesh, scene, order, seed, rays, lit, pool, threads, load_hybrid())
             coefficients[work.lit] = work.unshadowed - run(work.trace(0, rays))[1]

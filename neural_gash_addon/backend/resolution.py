@@ -18,6 +18,7 @@ from . import methods
 from . import spherical_harmonics as sh
 from .errors import UserError
 from .geometry import Surface, TriangleMesh
+from .pilot import pilot_rays
 from .progress import scaled
 from .raster import Coverage, Layout
 from .raycast import Geometry, Occluders
@@ -25,49 +26,45 @@ from .texels import NormalMap, scattered, texel_points
 from .unwrap import Charts, lay_out
 
 TRIALS = (32, 64, 128, 256, 512, 1024, 2048)  # texels a side
-MAX_FIT = 4096                    # the largest texture that an error asks for,
-AUTO_SIDE = 1024                  # and where it was not even asked for a texture
-_POINTS, _RAYS = 4096, 256        # of the surface that are looked at; from each and its texels, for each of two traces
-_FEW_POINTS, _FEW_RAYS = 1024, 64  # where it is known about: a fifth of the time, and as near on meshes that were tried
+MAX_FIT = 4096                    # the largest texture that an error asks for
+_POINTS = 4096                    # of the surface that are looked at
+_TIMES = 2                        # the rays of a pilot, from each and from its texels, for each of two traces
 _LEAST_RATE, _MOST_RATE = 0.5, 2.0  # powers of the size by which an error falls: at a shadow's edge, where smooth
 _DARK = 1e-3                      # of the transfer in the open: less than this on the whole is not seen
 _STEP = 16                        # texels to which sizes are rounded up
 
-Trial = Callable[..., Generator[float, None, int]]  # of UVs; with near=
+Trial = Callable[[NDArray], Generator[float, None, int]]
 
 
 def fitting_side(surface: Surface, uv: NDArray, *, error: float, method: str = "embree", order: int = 5,
                  occluders: Sequence[Geometry] = (), normal_maps: Sequence[NormalMap] = (), seed: int = 0,
-                 threads: int | None = None, near: int = 0, most: int = MAX_FIT) -> Generator[float, None, int]:
+                 threads: int | None = None) -> Generator[float, None, int]:
     """The side of the smallest texture whose lookups have an error.
 
     Args:
         uv: (C, 2) of each face corner, 0 to 1, without overlaps.
         error: relative L2, over the surface by area, of transfer looked up bilinearly.
         method, order, occluders, normal_maps, seed, threads: as `texture.bake`.
-        near: what it is about, where that is known: smaller sides than half of it are not tried, and fewer points are
-            looked at. most: of the answer.
     Yields:
         Progress, 0 to 1.
     Returns:
-        Texels a side, TRIALS[0] to `most`, a multiple of 16.
+        Texels a side, TRIALS[0] to MAX_FIT, a multiple of 16.
     """
-    sample = scattered(surface, _FEW_POINTS if near else _POINTS, np.random.default_rng(seed))
+    sample = scattered(surface, _POINTS, np.random.default_rng(seed))
     places = np.einsum("nc,ncx->nx", sample.barycentric, uv[surface.corners[sample.faces]])
     points = texel_points(surface, sample, normal_maps)
     scene = None
     if methods.METHODS[method].sees:
         scene = Occluders([(points.positions, points.triangles), *occluders], points.resolution)
     trace = partial(_traced, method=method, order=order, scene=scene, seed=seed, threads=threads,
-                    rays=_FEW_RAYS if near else _RAYS)
+                    rays=_TIMES * pilot_rays(error))
     yield 0.0
     exact = trace(points, first=0)
     dark = _DARK ** 2 * float(np.square(sh.cosine_lobe(points.normals, order)).sum())
     energy = max(float((exact[0] * exact[1]).sum()), dark)
     errors: list[float] = []
-    trials = [side for side in TRIALS if min(near, most) <= 2 * side and side <= most]
-    for number, side in enumerate(trials):
-        yield (number + 1) / (len(trials) + 1)
+    for number, side in enumerate(TRIALS):
+        yield (number + 1) / (len(TRIALS) + 1)
         coverage = Layout(uv[surface.corners], surface.triangles, side).coverage()
         if not len(coverage.texels):
             errors.append(1.0)
@@ -80,7 +77,7 @@ def fitting_side(surface: Surface, uv: NDArray, *, error: float, method: str = "
         errors.append(max(float((wrong[0] * wrong[1]).sum()) / max(energy, 1e-300), 0.0) ** 0.5)
         if errors[-1] <= error:
             break
-    return min(int(np.ceil(_reached(trials[:len(errors)], errors, error) / _STEP)) * _STEP, most)
+    return min(int(np.ceil(_reached(TRIALS[:len(errors)], errors, error) / _STEP)) * _STEP, MAX_FIT)
 
 
 def fitting_density(charts: Charts, trial: Trial) -> Generator[float, None, float]:
@@ -126,9 +123,9 @@ def _nearest(coverage: Coverage, texels: NDArray[np.int64]) -> NDArray[np.int64]
 def _traced(points: TriangleMesh, *, method: str, order: int, scene: Occluders | None, seed: int, threads: int | None,
             rays: int, first: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Two traces (n, K) of the same points, with seeds of their own; `first` numbers them."""
-    # a sample has no neighbours to learn from
-    plain, wish = ("embree", rays) if scene is not None else (method, None)
-    one, two = (methods.run(methods.bake(points, plain, order, rays=wish, scene=scene, threads=threads,
+    plain = "embree" if scene is not None else method  # a sample has no neighbours to learn from
+    one, two = (methods.run(methods.bake(points, plain, order, rays=rays if scene is not None else None, scene=scene,
+                                         threads=threads,
                                          seed=int(np.random.SeedSequence([seed, 1, first + n]).generate_state(1)[0])))
                 for n in range(2))
     return one.coefficients.astype(np.float64), two.coefficients.astype(np.float64)

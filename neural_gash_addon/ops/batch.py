@@ -11,20 +11,20 @@ from pathlib import Path
 import bpy
 
 from ..backend import methods
+from ..backend.advice import missed, said
 from ..backend.atlas import Placed, place
-from ..backend.auto_bake import Elsewhere
 from ..backend.errors import UserError
 from ..backend.progress import scaled
 from ..backend.record import BakeRecord
 from ..backend.texture import TextureTransfer, alike, merged
 from ..backend.transfer import Transfer
-from ..properties import NeuralGashSettings
+from ..properties import TEXTURE, NeuralGashSettings
 from ..scene.images import make_images, remove_unused
 from ..scene.lamps import LitScenes
 from .job import Job, check, finish, prepare, size
 from .lamps import LampReader
 
-_PLACING = 0.1  # of the progress
+_PLACING, _LOOKING = 0.1, 0.2  # of the progress
 Result = Transfer | TextureTransfer | UserError
 
 
@@ -43,13 +43,8 @@ class Batch:
 
     jobs: list[Job]
     refused: list[Outcome]
-    share: bool   # one texture for all
+    shared: bool  # one texture for all
     baking: Generator[float, None, list[Result]]
-
-    @property
-    def shared(self) -> bool:
-        """Whether several have one texture."""
-        return self.share and sum(job.texture is not None for job in self.jobs) > 1
 
     @property
     def names(self) -> list[str]:
@@ -86,47 +81,32 @@ def prepare_batch(context: bpy.types.Context, objects: Sequence[bpy.types.Object
         meshes[obj.data.session_uid] = obj.name
     if not jobs:
         raise UserError(refused[0].sentence)
-    return Batch(jobs, refused, settings.share, _bake(jobs, settings.share, size(settings), settings.tolerance))
+    shared = settings.target == TEXTURE and settings.share and len(jobs) > 1
+    return Batch(jobs, refused, shared, _bake(jobs, shared, size(settings)))
 
 
-def _bake(jobs: list[Job], share: bool, sizes: dict, tolerance: float) -> Generator[float, None, list[Result]]:
-    """The arrays of all jobs, one after another; never touches bpy. Jobs that move to a texture are replaced."""
-    results: dict[int, Result] = {}
-    why: dict[int, Callable[[int], str]] = {}
+def _bake(jobs: list[Job], shared: bool, sizes: dict) -> Generator[float, None, list[Result]]:
+    """The arrays of all jobs, one after another; never touches bpy."""
+    results: list[Result] = []
     done = 0.0
-
-    def baked(number: int, bake: Generator[float, None, Transfer | TextureTransfer], part: float
-              ) -> Generator[float, None, None]:
-        nonlocal done
+    if shared:
+        began = time.perf_counter()
+        placing = place([job.texture.part for job in jobs if job.texture], **sizes)
+        places, side = yield from scaled(placing, 0, _PLACING)
+        done, spent = _PLACING, (time.perf_counter() - began) / len(jobs)
+        bakes = [_placed(job, placed, side, spent) for job, placed in zip(jobs, places, strict=True)]
+    else:
+        bakes = [_textured(job, sizes) if job.texture else job.bake() if job.finer is None else _automatic(job, sizes)
+                 for job in jobs]
+    for number, bake in enumerate(bakes):
+        share = (1 - done) / len(jobs)
         try:
-            results[number] = yield from scaled(bake, done, part)
-            done += part
-        except Elsewhere as wanted:
-            jobs[number], why[number] = jobs[number].moved(wanted, tolerance)
+            results.append((yield from scaled(bake, done + number * share, share)))
         except UserError as error:
             if len(jobs) == 1:
                 raise
-            results[number] = error
-
-    for number, job in enumerate(jobs):
-        if job.texture is None:
-            yield from baked(number, job.bake(), 1 / len(jobs))
-    textured = {number: job for number, job in enumerate(jobs) if number not in results}
-    if share and len(textured) > 1:
-        began, part = time.perf_counter(), _PLACING * (1 - done)
-        placing = place([job.texture.part for job in textured.values() if job.texture], **sizes)
-        places, side = yield from scaled(placing, done, part)
-        done, spent = done + part, (time.perf_counter() - began) / len(textured)
-        bakes = [_placed(job, placed, side, spent) for job, placed in zip(textured.values(), places, strict=True)]
-    else:
-        bakes = [_textured(job, sizes) for job in textured.values()]
-    part = (1 - done) / max(len(textured), 1)
-    for number, bake in zip(textured, bakes, strict=True):
-        yield from baked(number, bake, part)
-        found = results[number]
-        if number in why and isinstance(found, TextureTransfer):
-            results[number] = replace(found, record=found.record.also(why[number](found.record.side)))
-    return [results[number] for number in range(len(jobs))]
+            results.append(error)
+    return results
 
 
 def _textured(job: Job, sizes: dict) -> Generator[float, None, Transfer | TextureTransfer]:
@@ -136,6 +116,18 @@ def _textured(job: Job, sizes: dict) -> Generator[float, None, Transfer | Textur
     (placed,), side = yield from scaled(place([job.texture.part], **sizes), 0, _PLACING)
     spent = time.perf_counter() - began
     return (yield from scaled(_placed(job, placed, side, spent), _PLACING, 1 - _PLACING))
+
+
+def _automatic(job: Job, sizes: dict) -> Generator[float, None, Transfer | TextureTransfer]:
+    """The bake of an object to vertices; and to a texture, where they miss what is inside faces."""
+    assert job.finer is not None
+    found = yield from scaled(job.bake(), 0, _LOOKING)
+    wrong, tolerance = found.record.between_error, found.record.tolerance
+    if wrong is None or tolerance is None or not missed(wrong, tolerance):
+        return found
+    finer = yield from scaled(_textured(job.finer, sizes), _LOOKING, 1 - _LOOKING)
+    record = finer.record.also(said(wrong, tolerance, finer.record.side))
+    return replace(finer, record=replace(record, seconds=record.seconds + found.record.seconds))
 
 
 def _placed(job: Job, placed: Placed, side: int, spent: float
@@ -163,21 +155,19 @@ def finish_batch(context: bpy.types.Context, batch: Batch, results: Sequence[Res
             if job.lamps is not None and lit.of(check(context, job))[1] != job.lamps.key:
                 raise UserError(f"The lamps of '{job.name}', or what they light, were changed during the bake; bake "
                                 "again.")
-            if batch.shared and job.texture is not None:
+            if batch.shared:
                 owners.append(check(context, job).data)
-            baked.append((job, result))
+            baked.append((job.finer if job.finer and isinstance(result, TextureTransfer) else job, result))
         except UserError as error:
             outcomes.append(Outcome(job.name, None, _named(job, error, len(batch.jobs) + len(batch.refused))))
     images: list[bpy.types.Image] = []
-    whole = alike([t for _, t in baked if isinstance(t, TextureTransfer)]) if batch.shared else []
-    if whole:
-        parts = iter(whole)
-        baked = [(job, t if job.texture is None else next(parts)) for job, t in baked]
-        of = [job for job, _ in baked if job.texture is not None]
-        options = of[0].texture
+    if batch.shared and baked:
+        whole = alike([t for _, t in baked if isinstance(t, TextureTransfer)])
+        baked = [(job, part) for (job, _), part in zip(baked, whole, strict=True)]
+        options = baked[0][0].texture
         assert options is not None
-        records = {job.name: {"frame": job.frame, "uv_map": options.uv_map} for job in of}
-        images = make_images(of[0].name, merged(whole), options.folder, options.half, json.dumps(records),
+        records = {job.name: {"frame": job.frame, "uv_map": options.uv_map} for job, _ in baked}
+        images = make_images(baked[0][0].name, merged(whole), options.folder, options.half, json.dumps(records),
                              owners=owners)
     for job, transfer in baked:
         try:

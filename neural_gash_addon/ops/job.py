@@ -14,20 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend import methods
-from ..backend.advice import said
 from ..backend.atlas import Part, check_area, check_part
-from ..backend.auto_bake import Elsewhere
 from ..backend.errors import UserError
 from ..backend.exchange import check_folder
 from ..backend.geometry import Surface
 from ..backend.lamps import Lamps
+from ..backend.raycast import Geometry
 from ..backend.record import VERSION, BakeRecord
-from ..backend.resolution import AUTO_SIDE, MAX_FIT, fitting_side
+from ..backend.resolution import fitting_side
 from ..backend.texels import NormalMap
 from ..backend.texture import TextureTransfer, remove_tiles
 from ..backend.texture import bake as bake_texture
 from ..backend.transfer import Transfer
-from ..properties import AUTO, COLLECTION, DENSITY, TEXTURE, VERTICES, NeuralGashSettings
+from ..properties import AUTOMATIC, COLLECTION, DENSITY, FIT, RAYS, TEXTURE, NeuralGashSettings
 from ..scene.attributes import read_record, write_textures, write_transfer
 from ..scene.lighting import apply_light, take_light
 from ..scene.normal_maps import read_normal_maps
@@ -76,54 +75,55 @@ class Job:
     texture: TextureOptions | None  # None: to vertices
     bounces: bool          # light was to bounce, so the albedo counts
     lamps: Lamps | None    # what lights it besides, if that was wanted
-    note: str = ""         # what the record says of the target besides
-    instead: Job | UserError | None = None  # to a texture, or why not; where the bake decides, which is movable then
-
-    def moved(self, wanted: Elsewhere, tolerance: float) -> tuple[Job, Callable[[int], str]]:
-        """The job of a texture that is wanted instead, and what to say once its side is known. Raises UserError."""
-        if isinstance(self.instead, UserError):
-            raise self.instead
-        assert self.instead is not None and self.instead.texture is not None
-        options = self.instead.texture
-        assert options.part.trial is not None
-        part = replace(options.part, trial=partial(options.part.trial, near=wanted.side))
-
-        def why(side: int) -> str:
-            most = ", the largest that Automatic makes" if side >= AUTO_SIDE else ""
-            return said(wanted.inside, tolerance, f"texture of {side}{most}")
-
-        return replace(self.instead, texture=replace(options, part=part)), why
+    finer: Job | None = None  # to a texture, if vertices miss what is inside faces: see `prepare`
 
 
 def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: NeuralGashSettings,
-            tiles: Path | None = None, group: Sequence[bpy.types.Object] = (), lamps: LampReader | None = None,
-            target: str = "") -> Job:
+            tiles: Path | None = None, group: Sequence[bpy.types.Object] = (), lamps: LampReader | None = None) -> Job:
     """Read the object and what blocks its light.
+
+    Where the target is automatic and a plan is to keep to a tolerance, the job is to vertices, and has one to a texture
+    beside it, for what they may miss; unless the mesh can have no texture.
 
     Args:
         tiles: a folder for the finished tiles of a texture, from which a bake that was killed goes on.
         group: the objects that are baked together with it. lamps: of them, if they are to be baked too.
-        target: another than that of the settings.
     Raises:
         UserError: that cannot be baked.
     """
     if obj is None:
         raise UserError(refusal(None))
+    read = read_object(obj, context.evaluated_depsgraph_get())
+    mode = occluder_mode(obj, settings, group) if methods.METHODS[settings.method].sees else SELF
+    occluders = read_occluders(obj, mode, context.evaluated_depsgraph_get())
+    prepared = partial(_prepared, context, obj, settings, read, mode, occluders,
+                       lit=lamps.of(obj) if lamps is not None else None)
+    if settings.target == TEXTURE:
+        return prepared(to_texture=True, tiles=tiles)
+    job = prepared(to_texture=False)
+    if settings.target == AUTOMATIC and methods.METHODS[settings.method].plans and settings.quality != RAYS:
+        try:
+            return replace(job, finer=prepared(to_texture=True, tiles=tiles))
+        except UserError:  # no room for a UV map, for instance: then vertices it is
+            return job
+    return job
+
+
+def _prepared(context: bpy.types.Context, obj: bpy.types.Object, settings: NeuralGashSettings, read: SceneMesh,
+              mode: str, occluders: Sequence[Geometry], *, to_texture: bool, tiles: Path | None = None,
+              lit: Lamps | None) -> Job:
+    """The job of one target. Raises UserError: that cannot be baked."""
     depsgraph = context.evaluated_depsgraph_get()
-    read = read_object(obj, depsgraph)
-    target = target or (AUTO if settings.undecided() else TEXTURE if settings.target == TEXTURE else VERTICES)
     method = methods.METHODS[settings.method]
-    mode = occluder_mode(obj, settings, group) if method.sees else SELF
     quality = settings.tracing()
     reflection = None
-    if method.traces and settings.bounces:
-        if target != TEXTURE:
+    if method.bounces and settings.bounces:
+        if not to_texture:
             check_attributes(settings.order)
         reflection = read_reflection(obj, mode, depsgraph, settings.bounces)
-    occluders = read_occluders(obj, mode, depsgraph)
-    lit = lamps.of(obj) if lamps is not None else None
-
-    def textured() -> Job:
+    bake: Callable[..., Generator[float, None, Transfer | TextureTransfer]]
+    texture = None
+    if to_texture:
         maps = read_normal_maps(obj, depsgraph, read.surface, read.matrix)
         what = {"method": settings.method, "order": settings.order, "occluders": occluders, "normal_maps": maps}
         texture = _texture_options(obj, settings, read.surface, tiles, what)
@@ -131,25 +131,13 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
         key = _key(settings, before, read.matrix, maps, lit)
         bake = partial(bake_texture, read.surface, **what, **quality, folder=tiles, reflection=reflection, key=key,
                        lamps=lit, whole=settings.gloss)  # metals show the high bands, which dull surfaces do not
-        return Job(obj.session_uid, obj.name, read, bake, mode, before, key, read.frame, texture,
-                   reflection is not None, lit)
-
-    if target == TEXTURE:
-        return textured()
-    instead: Job | UserError | None = None
-    if target == AUTO:
-        try:
-            instead = textured()
-        except UserError as error:  # which need not trouble whom vertices are enough for
-            instead = error
-    before = fingerprint(obj, depsgraph, mode, bounces=reflection is not None)
-    key = _key(settings, before, read.matrix, (), lit)
-    bake = partial(methods.bake, read.mesh, settings.method, settings.order, **quality, occluders=occluders,
-                   reflection=reflection, lamps=lit, movable=instead is not None)
-    if isinstance(instead, Job):
-        key = json.dumps({**json.loads(key), "texture": instead.key}, sort_keys=True)
-    return Job(obj.session_uid, obj.name, read, bake, mode, before, key, read.frame, None, reflection is not None, lit,
-               settings.target_note(), instead)
+    else:
+        before = fingerprint(obj, depsgraph, mode, bounces=reflection is not None)
+        key = _key(settings, before, read.matrix, (), lit)
+        bake = partial(methods.bake, read.mesh, settings.method, settings.order, **quality, occluders=occluders,
+                       reflection=reflection, lamps=lit)
+    return Job(obj.session_uid, obj.name, read, bake, mode, before, key, read.frame, texture,
+               reflection is not None, lit)
 
 
 def occluder_mode(obj: bpy.types.Object, settings: NeuralGashSettings, group: Sequence[bpy.types.Object]) -> str:
@@ -178,10 +166,7 @@ def _texture_options(obj: bpy.types.Object, settings: NeuralGashSettings, surfac
         check_folder(folder)
     if uv is None:
         check_room(obj.data)
-    trial = None
-    if settings.fits():
-        most = AUTO_SIDE if settings.target == AUTO else MAX_FIT
-        trial = partial(fitting_side, surface, error=settings.tolerance, **what, most=most)
+    trial = partial(fitting_side, surface, error=settings.tolerance, **what) if _fits(settings) else None
     part = Part(surface, uv, trial, obj.name)
     check_part(part)  # here, as a texture that is shared is placed for all objects at once
     check_area(part)
@@ -190,10 +175,15 @@ def _texture_options(obj: bpy.types.Object, settings: NeuralGashSettings, surfac
 
 def size(settings: NeuralGashSettings) -> dict:
     """The arguments of `atlas.place` that say how large a texture is."""
-    # a UV map that is there has no metres
-    dense = settings.sizing == DENSITY and not settings.fits() and not settings.uv_map
-    return {"side": None if dense or settings.fits() else settings.side,
+    dense = settings.sizing == DENSITY and not settings.uv_map  # a UV map that is there has no metres
+    dense = dense and not _fits(settings)
+    return {"side": None if dense or _fits(settings) else settings.side,
             "texels_per_metre": settings.texels_per_metre if dense else None, "padding": settings.padding}
+
+
+def _fits(settings: NeuralGashSettings) -> bool:
+    """Whether a texture is as large as the tolerance asks for."""
+    return settings.sizing == FIT or settings.target == AUTOMATIC
 
 
 def _key(settings: NeuralGashSettings, shape: str, matrix: NDArray, maps: Sequence[NormalMap], lamps: Lamps | None
@@ -232,8 +222,7 @@ def recorded(context: bpy.types.Context, job: Job, obj: bpy.types.Object, transf
     if job.bounces and transfer.record.colours == 1:  # nothing bounced: no colour counts
         now = fingerprint(obj, context.evaluated_depsgraph_get(), job.occluders,
                           read_uv(obj.data, uv_map) if uv_map else None)
-    return replace(transfer.record, occluders=job.occluders, fingerprint=now, frame=job.frame, uv_map=uv_map,
-                   plan=f"{transfer.record.plan} {job.note}".strip())
+    return replace(transfer.record, occluders=job.occluders, fingerprint=now, frame=job.frame, uv_map=uv_map)
 
 
 def finish(context: bpy.types.Context, job: Job, transfer: Transfer | TextureTransfer,

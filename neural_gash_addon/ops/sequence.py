@@ -15,7 +15,7 @@ from ..backend.exchange import check_folder
 from ..backend.progress import scaled
 from ..backend.sequence import SUFFIX, Writer
 from ..backend.transfer import Transfer
-from ..properties import TEXTURE, VERTICES
+from ..properties import TEXTURE
 from ..scene.attributes import SEQUENCE
 from ..scene.live import suspended
 from .bake import Baking, Worker, bake_refusal, targets
@@ -100,7 +100,7 @@ def bake_sequence(context: bpy.types.Context, objects: list[bpy.types.Object]
         """Bake one object in one frame."""
         obj = _object(uid, uids[uid])
         together = [o for o in bpy.data.objects if o.session_uid in group]
-        job = prepare(context, obj, _scene(its).neural_gash, group=together, target=VERTICES)
+        job = prepare(context, obj, _scene(its).neural_gash, group=together)
         found = yield from job.bake(whole=True)  # what other frames will want is not known; one order for all
         assert isinstance(found, Transfer)
         transfer = replace(found, record=recorded(context, job, obj, found))

@@ -14,7 +14,7 @@ from ..backend.record import BakeRecord
 from ..ops import state
 from ..ops.job import percent
 from ..ops.preset import PRESETS, preset_in_force
-from ..properties import AUTO, COLLECTION, DENSITY, FIT, RAYS, TEXTURE, NeuralGashSettings
+from ..properties import COLLECTION, DENSITY, FIT, RAYS, TEXTURE, NeuralGashSettings
 from ..scene import live, staleness
 from ..scene.attributes import RECORD, SEQUENCE, has_bake
 from ..scene.gloss_bounce import bounces_shown, has_bounces
@@ -192,7 +192,7 @@ class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):
             layout.prop(settings, "occluders")
             if settings.occluders == COLLECTION:
                 layout.prop(settings, "collection")
-        if METHODS[settings.method].traces:
+        if METHODS[settings.method].bounces:
             layout.prop(settings, "bounces")
         layout.prop(settings, "lamps")
         if settings.lamps:
@@ -200,22 +200,15 @@ class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):
         if settings.lamps and not METHODS[settings.method].traces:
             layout.prop(settings, "tolerance")
         layout.prop(settings, "target", expand=True)
-        if settings.target == TEXTURE or settings.undecided():
+        if settings.target == TEXTURE:
             self._texture(layout, settings, context.object)
-        elif settings.target_note():
-            _paragraph(layout.column(align=True), settings.target_note(), "INFO")
 
     def _texture(self, layout: bpy.types.UILayout, settings: NeuralGashSettings, obj: bpy.types.Object | None) -> None:
         """What a texture has beside."""
         if obj is not None and obj.type == "MESH":
             layout.prop_search(settings, "uv_map", obj.data, "uv_layers")
-        if settings.target == AUTO:
-            _paragraph(layout.column(align=True), "Should it be a texture:", "TEXTURE")
-        else:
-            layout.prop(settings, "sizing", expand=True)
-        if settings.target == AUTO:
-            pass  # the tolerance decides
-        elif settings.sizing == FIT:
+        layout.prop(settings, "sizing", expand=True)
+        if settings.sizing == FIT:
             traces = METHODS[settings.method].traces
             if not (settings.quality != RAYS if traces else settings.lamps):  # else it is above already
                 layout.prop(settings, "tolerance")

@@ -18,7 +18,6 @@ FLOOR = ([(-2, -2, 0), (2, -2, 0), (2, 2, 0), (-2, 2, 0)], [(0, 1, 2, 3)])
 def draft(settings):
     """Settings with which open surfaces want three of five bands."""
     settings.method, settings.quality, settings.tolerance, settings.order = "auto", "TOLERANCE", 0.1, 5
-    settings.target = "VERTICES"
     return settings
 
 

@@ -50,7 +50,7 @@ bpy.ops.object.select_all(action="SELECT")
 bpy.ops.object.delete()
 bpy.ops.mesh.primitive_torus_add()
 bpy.ops.object.shade_smooth()
-bpy.context.scene.neural_gash.order, bpy.context.scene.neural_gash.target = 4, "VERTICES"
+bpy.context.scene.neural_gash.order = 4
 assert bpy.ops.neural_gash.bake() == {"FINISHED"}
 attributes = [name for name, _ in bpy.context.object.data.attributes.items() if name.startswith("_prt_")]
 assert attributes == [f"_prt_{i}" for i in range(4)], attributes

@@ -229,7 +229,6 @@ def build():
     yield 0.5
     expect(region.active_panel_category == TAB, "panel_open")
     yield from picture("1_before")
-    settings().target = "VERTICES"  # what is checked are their numbers; before this step, as undo takes later ones back
     with in_view():
         bpy.ops.ed.undo_push(message="Session begins")
 
