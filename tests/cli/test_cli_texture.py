@@ -47,7 +47,8 @@ def test_options_that_do_not_fit_are_refused(refused, blend, tmp_path):
 def test_the_planner_chooses_the_target(run, refused, blend, tmp_path):
     """A coarse ring wants a texture for what little is inside its faces, and by 0.3 does not."""
     def report(tolerance, *arguments):
-        done = run("bake", blend, "--object", "Ring", "--texture", "auto", "--tolerance", tolerance, "--json", *arguments)
+        done = run("bake", blend, "--object", "Ring", "--texture", "auto", "--json", "--tolerance", tolerance,
+                   *arguments)
         assert done.returncode == 0, done.stderr
         return json.loads(done.stdout.splitlines()[-1])
 
