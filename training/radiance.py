@@ -172,7 +172,7 @@ def train(kept: list[Path], held: list[Room], steps: int, seed: int, checkpoint:
     further: from the weights that ship instead of random ones.
     """
     torch.manual_seed(seed)
-    embedded = embedding_bake.network()
+    embedded = trained()
     model = embedding_bake.radiance_network(embedded) if further else Radiance(embedded.settings)
     model = model.to(loop.device())
 

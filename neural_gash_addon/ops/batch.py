@@ -96,9 +96,12 @@ def _bake(jobs: list[Job], share: bool, sizes: dict) -> Generator[float, None, l
         try:
             results[number] = yield from scaled(bake, done, part)
         except UserError as error:
-            if len(jobs) == 1:
+            if isinstance(results.get(number), Transfer):  # a texture that cannot be: the vertices are there
+                pass
+            elif len(jobs) == 1:
                 raise
-            results[number] = error
+            else:
+                results[number] = error
         done += part
 
     for number, job in enumerate(jobs):

@@ -188,3 +188,18 @@ def test_a_bake_that_ends_elsewhere_leaves_one_record(make, automatic):
     assert record(coarse).target == "texture" and staleness.status(coarse) != staleness.STALE
     bpy.ops.neural_gash.clear()
     assert not coarse.data.uv_layers and not np.any(["neural_gash" in a.name for a in coarse.data.attributes])
+
+
+def test_where_a_texture_cannot_be_made_the_vertices_are_kept(make, automatic, monkeypatch):
+    from neural_gash_addon.backend.errors import UserError
+    from neural_gash_addon.ops import batch
+
+    def fails(*_):
+        raise UserError("No.")
+        yield 0.0
+
+    monkeypatch.setattr(batch, "_textured", fails)
+    coarse = floor(make, 2)
+    table(make)
+    bake(coarse)
+    assert record(coarse).target == "vertices" and "a texture would have them." in record(coarse).plan
