@@ -8,6 +8,7 @@ local frame, where they are one matrix product for many points, and rotated once
 """
 from __future__ import annotations
 
+import copy
 from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
@@ -36,23 +37,42 @@ _TURNED_AT_ONCE = 2048  # points rotated by one worker at a time
 class BlockedEstimator:
     """Sums of Y_k over blocked rays, in each point's local frame."""
 
-    def __init__(self, mesh: TriangleMesh, occluders: Occluders, order: int, seed: int, rays: int, sets: int = SETS
-                 ) -> None:
+    def __init__(self, mesh: TriangleMesh, occluders: Occluders, order: int, seed: int, rays: int, sets: int = SETS,
+                 twins: bool = False) -> None:
         """rays: the most that any point will take. seed: independent seeds give independent estimates.
 
-        sets: fewer cost less where points are few, whose errors are then less independent.
+        sets: fewer cost less where points are few, whose errors are then less independent. twins: there will be some,
+        and as many sets for them.
         """
         rng = np.random.default_rng([seed, 0])
         self._occluders = occluders
         self._order = order
-        self._count, self._most, self._scramble = sets, rays, int(rng.integers(2**31))
-        self._made = np.zeros((sets, 0, 3))  # directions so far: most bakes stop long before the most rays
+        self._sets_each, self._count = sets, 2 * sets if twins else sets
+        self._most, self._scramble = rays, int(rng.integers(2**31))
+        self._made = np.zeros((self._count, 0, 3))  # directions so far: most bakes stop long before the most rays
         self._points, self._clearance = mesh.points, mesh.clearance
         self._normals = mesh.normals
         self._angles = rng.uniform(0, 2 * np.pi, len(mesh.points)).astype(np.float32)
         self._set_of_point = rng.integers(0, sets, len(mesh.points), dtype=np.uint8)
         self._excess: dict[tuple[int, int], NDArray] = {}
-        self._evaluated: tuple[tuple[int, int], NDArray] | None = None  # the last of `_harmonics`
+        self._evaluated: tuple[tuple[int, int], NDArray] | None = None  # of which directions, and their harmonics
+
+    def prepare(self, stop: int) -> None:
+        """Make the directions 0..stop now, and what is known of them."""
+        self._harmonics(0, stop)
+
+    def twins(self, points: NDArray, rng: np.random.Generator) -> BlockedEstimator:
+        """Of some of the points (n,), numbered anew: an estimate by other nets, independent of this one.
+
+        One that was made with `twins`, and `rng` must be independent of its seed. What was prepared is shared.
+        """
+        out = copy.copy(self)
+        out._points, out._clearance, out._normals = (
+            a[points] for a in (self._points, self._clearance, self._normals))
+        out._angles = rng.uniform(0, 2 * np.pi, len(points)).astype(np.float32)
+        out._set_of_point = rng.integers(self._sets_each, self._count, len(points), dtype=np.uint8)
+        out._excess = {}
+        return out
 
     def trace(self, pool: ThreadPoolExecutor, threads: int, points: NDArray, start: int, stop: int,
               sums: NDArray[np.float64]) -> Generator[float, None, None]:
@@ -111,11 +131,12 @@ class BlockedEstimator:
     def _harmonics(self, start: int, stop: int) -> NDArray[np.float64]:
         """(sets, stop - start, K) of the directions of each set."""
         known = self._evaluated
-        if known is None or known[0] != (start, stop):
+        if known is None or start < known[0][0] or stop > known[0][1]:
             local = self._sets(stop)[:, start:stop]
             known = (start, stop), sh.evaluate(local.reshape(-1, 3), self._order).reshape(*local.shape[:2], -1)
             self._evaluated = known
-        return known[1]
+        (first, _), harmonics = known
+        return harmonics[:, start - first:stop - first]
 
     def _sets(self, stop: int) -> NDArray[np.float64]:
         """(sets, at least stop, 3) directions. A longer net begins with the shorter ones."""

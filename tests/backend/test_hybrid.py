@@ -118,12 +118,13 @@ def test_takes_most_of_the_noise_away(case, rays, factor):
     assert better < factor * plain
 
 
-@pytest.mark.parametrize("count", [6, 7])
+@pytest.mark.parametrize("count", [6, 7, 1, 4096, 4097, 4099])
 def test_points_between_others_see_as_much_and_differ_from_an_even_sky_alike(count):
     rng = np.random.default_rng(count)
     unshadowed = sh.cosine_lobe(_unit(rng.normal(size=(count, 3))), 3)
     some = rng.normal(size=(-(-count // 2), 9)).astype(np.float32)
-    found = hybrid.between(some, unshadowed.astype(np.float32))
+    with ThreadPoolExecutor(2) as pool:
+        found = hybrid.between(some, unshadowed.astype(np.float32), pool)
     for i in range(count):
         beside = [i] if i % 2 == 0 else [j for j in (i - 1, i + 1) if j < count]
         share = np.mean([some[j // 2, 0] for j in beside])
