@@ -8,7 +8,7 @@
 # make planner  what the planner picks, beside the cheapest plan that meets the tolerance
 # make stability  where methods fail: a table, in docs/stability.md (QUICK=1: a small one, printed)
 # make train NETWORK=gnn   label meshes and train from nothing: gnn, hybrid, sky, gnn-paper, mlp, end-to-end or student;
-#   NETWORK=embedding, and then radiance on its codes, label rooms instead
+#   NETWORK=embedding, and then radiance on its codes, label rooms instead; NETWORK=bounces, on the codes of sky, meshes in colours
 # make lint, package, bench, docs-pictures, clean: as they say
 .PHONY: chart data rooms train demo docs-pictures planner stability test test-window lint package bench clean system-packages
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
@@ -78,7 +78,8 @@ rooms: .venv/ready
 
 NETWORK ?= gnn
 train: $(if $(filter embedding radiance,$(NETWORK)),rooms,data)
-	$(PY) -m training.$(if $(filter gnn hybrid sky embedding radiance,$(NETWORK)),$(NETWORK),paper --network $(NETWORK))
+	$(if $(filter bounces,$(NETWORK)),$(PY) -m training.bounce_labels)
+	$(PY) -m training.$(if $(filter gnn hybrid sky bounces embedding radiance,$(NETWORK)),$(NETWORK),paper --network $(NETWORK))
 
 clean:
 	rm -rf .venv .venv52 build dist out .pytest_cache .mypy_cache .ruff_cache

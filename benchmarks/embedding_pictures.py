@@ -58,7 +58,7 @@ def main() -> None:
     from matplotlib.image import imsave
 
     torch.set_num_threads(1)
-    model = embedding_bake.network().cpu()
+    model = embedding_bake.network()
     strips, sums = [], {}
     print("| room | light | s | MSE | SSIM | rel. MSE |\n|---|---|---|---|---|---|")
     for job in room_labels.evaluation(arguments.rooms, None, REFERENCE):

@@ -20,13 +20,13 @@ import trials_rooms
 from trials_rooms import NEAR, Answers, asked, both, error, furnished, lit
 
 from neural_gash_addon.backend import embedding_bake
-from neural_gash_addon.backend.lit_points import POINTS, LitPoints
+from neural_gash_addon.backend.lit_points import LitPoints
 from neural_gash_addon.backend.lit_scene import LitScene
 from neural_gash_addon.backend.nearest import nearest_to
 from training import embedding as judging
 from training import room_labels
 
-COUNTS, PATHS, NEIGHBOURS = (1024, 2048, 4096, 8192), (16, 64, 256), (4, 8, 16, 32)
+COUNTS, PATHS, NEIGHBOURS = (1024, 2048, 4096, 8192, 0), (16, 64, 256), (4, 8, 16, 32)
 
 
 def sizes(model, jobs: Sequence[room_labels.Job]) -> None:
@@ -41,10 +41,11 @@ def sizes(model, jobs: Sequence[room_labels.Job]) -> None:
             found = [[error(light, sample.truth[rows], sample.noise[rows])
                       for light in both(model, give(value, scene, sample), sample.queries[rows], sample.asked[rows])]
                      for scene, sample in kept]
-            print(f"| {value:,} | {np.median(found, 0)[0]:.3f} | {np.median(found, 0)[1]:.3f} |", flush=True)
+            medians = " | ".join(f"{median:.3f}" for median in np.median(found, 0))
+            print(f"| {f'{value:,}' if value else 'by area'} | {medians} |", flush=True)
 
-    table("scene points", COUNTS, lambda count, scene, _: lit(scene, count))
-    table("paths of a scene point", PATHS, lambda paths, scene, _: lit(scene, POINTS, paths))
+    table("scene points", COUNTS, lambda count, scene, _: lit(scene, count or None))
+    table("paths of a scene point", PATHS, lambda paths, scene, _: lit(scene, paths=paths))
     print("\n| k | network |\n|---|---|")
     for k in NEIGHBOURS:
         found = []
@@ -77,7 +78,7 @@ def main() -> None:
     import torch
 
     torch.set_num_threads(1)
-    model = embedding_bake.network().cpu()
+    model = embedding_bake.network()
     if arguments.only in (None, "sizes"):
         sizes(model, room_labels.evaluation(arguments.rooms, None, room_labels.VALIDATION_RAYS))
     if arguments.only in (None, "edits"):

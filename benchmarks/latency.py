@@ -20,7 +20,7 @@ from memory import _megabytes
 from meshes import knot
 from table import machine
 
-from neural_gash_addon.backend import cones, gnn, gnn_bake, methods, paper_bake, refine, weights
+from neural_gash_addon.backend import cones, gnn, gnn_bake, methods, paper_bake, refine, sight, weights
 from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.geometry import TriangleMesh
 from neural_gash_addon.backend.graph import graph
@@ -70,11 +70,16 @@ def paper_stages(mesh: TriangleMesh) -> dict[str, float]:
 
     clock, network = Clock(), paper.TwoStage()
     edges = clock("graph", lambda: graph(mesh.points, neighbours(mesh)))
-    encoded = clock("encode", lambda: paper_bake.encoded(mesh))
+    known = clock("spread", lambda: sight.places(mesh.points, mesh.normals))
+    encoded = clock("encode", lambda: sight.encode(known.points, known.normals))
     x, source, start = (torch.from_numpy(a) for a in (encoded, edges.source, edges.start))
     network.eval()
+    parts, found = known.sights(), []
     with torch.no_grad():
-        seen = clock("stage 1", lambda: torch.sigmoid(network.visibility(x, source, start)))
+        while (part := clock("hear", lambda: next(parts, None))) is not None:
+            given = sight.Sight(*map(torch.from_numpy, part))
+            found.append(clock("stage 1", lambda given=given: torch.sigmoid(network.visibility.ask(given))))
+        seen = torch.cat(found)
         clock("stage 2", lambda: network.coefficients(torch.cat([x, seen], 1), source, start))
     clock("AO", lambda: refine.occlusion(mesh.points, mesh.normals, edges))
     clock.stages["all"] = sum(clock.stages.values())

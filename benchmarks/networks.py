@@ -18,11 +18,9 @@ import numpy as np
 from meshes import FOLDER, read
 from table import Table, processor_seconds, seconds
 
-from neural_gash_addon.backend import conformal, methods, metrics, paper_bake, weights
+from neural_gash_addon.backend import conformal, methods, metrics, sight, weights
 from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.geometry import TriangleMesh
-from neural_gash_addon.backend.graph import graph
-from neural_gash_addon.backend.neighbours import neighbours
 from neural_gash_addon.backend.raycast import Occluders
 from neural_gash_addon.backend.workers import default_threads
 from training import labels
@@ -52,10 +50,9 @@ def visibility_accuracy(mesh: TriangleMesh) -> float:
     network = paper.TwoStage()
     network.load_state_dict({name: torch.from_numpy(array.copy()) for name, array
                              in weights.load(weights.FOLDER / "gnn-paper.safetensors").items()})
-    edges = graph(mesh.points, neighbours(mesh))
+    parts = sight.places(mesh.points, mesh.normals).sights()
     with torch.no_grad():
-        logits = network.eval().visibility(*(torch.from_numpy(a) for a in (paper_bake.encoded(mesh), edges.source,
-                                                                           edges.start)))
+        logits = torch.cat([network.eval().visibility.ask(sight.Sight(*map(torch.from_numpy, part))) for part in parts])
     scene = Occluders([(mesh.positions, mesh.triangles)], mesh.resolution)
     truth = labels.visible(mesh, scene, conformal.hemisphere_directions(), labels.motor_frames)
     return accuracy(logits > 0, torch.from_numpy(truth))
@@ -87,12 +84,12 @@ def main() -> None:
     parser.add_argument("--only", help="files whose name has this in it")
     parser.add_argument("--processor", action="store_true",
                         help="processor time, as it would pass on both threads of a machine that nobody else uses")
-    parser.add_argument("--network", choices=NETWORKS, help="one of them alone")
+    parser.add_argument("--network", choices=tuple(NETWORKS), nargs="+", help="of them these alone")
     arguments = parser.parse_args()
     timed = partial(processor_seconds, threads=default_threads()) if arguments.processor else seconds
     if arguments.network:
-        NETWORKS[:] = [arguments.network]
-        COLUMNS[:] = [column for column in COLUMNS if column[0] in ("embree", arguments.network)]
+        NETWORKS[:] = arguments.network
+        COLUMNS[:] = [column for column in COLUMNS if column[0] in ("embree", *NETWORKS)]
     categories = {}
     if (FOLDER / "MANIFEST.csv").is_file():
         with (FOLDER / "MANIFEST.csv").open(newline="") as file:

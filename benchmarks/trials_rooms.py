@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from neural_gash_addon.backend import embedding_bake, irradiance, methods
 from neural_gash_addon.backend.embedding_bake import STRAIGHT
-from neural_gash_addon.backend.lit_points import POINTS, REFLECTED, LitPoints, lit_points
+from neural_gash_addon.backend.lit_points import REFLECTED, LitPoints, lit_points
 from neural_gash_addon.backend.lit_scene import LitScene
 from training import embedding as judging
 from training import room_labels, rooms
@@ -28,7 +28,7 @@ GREY, WHITE = (0.55, 0.55, 0.55), (0.75, 0.75, 0.75)
 COLUMNS = ("network, as a bake has it", "network alone", f"mean of {NEAR} nearest scene points", f"{PATHS} paths")
 
 
-def lit(scene: LitScene, count: int = POINTS, paths: int = REFLECTED) -> LitPoints:
+def lit(scene: LitScene, count: int | None = None, paths: int = REFLECTED) -> LitPoints:
     """Of one thread."""
     return methods.run(lit_points(scene, scene.occluders(), count, paths, threads=1))
 
@@ -148,7 +148,7 @@ def tried(scale: int = 1) -> list[dict]:
     Raises:
         UserError: no torch.
     """
-    model = embedding_bake.network().cpu()
+    model = embedding_bake.network()
     rows = []
     for name, scene_of in trials(scale).items():
         found = Answers(model, *scene_of())

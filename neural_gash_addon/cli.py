@@ -20,7 +20,7 @@ from .backend.lobes import GGX, PHONG
 from .cli_bake import check_bake, choose_meshes, finish_bake, prepare_bake
 from .cli_files import check_suffixes, choose, open_file, sentence, set_number
 from .ops.job import summary
-from .properties import DENSITY, FIT, RESOLUTION
+from .properties import AUTOMATIC, DENSITY, FIT, RESOLUTION
 from .scene import lighting
 from .scene.attributes import has_bake, read_record
 from .scene.gloss import can_gloss
@@ -63,7 +63,8 @@ def _parser() -> argparse.ArgumentParser:
                       "quicker")
     bake.add_argument("--texture", type=_side, metavar="SIDE",
                       help="bake to a texture of SIDE x SIDE texels instead; '50/m': so many texels a metre; 'fit': as "
-                           "large as the tolerance needs (0.02 with --rays)")
+                           "large as the tolerance needs (0.02 with --rays); 'auto': so where vertices miss shadows "
+                           "inside faces, else to vertices")
     bake.add_argument("--padding", type=int, metavar="TEXELS", help="around each part of the UV map of --texture (2)")
     bake.add_argument("--share", action="store_true", help="one texture for all objects, with --texture")
     bake.add_argument("--uv-map", metavar="NAME", default="", help="of the mesh, for --texture; else one is made")
@@ -105,12 +106,12 @@ def _parser() -> argparse.ArgumentParser:
 def _side(text: str) -> tuple[str, float]:
     """What decides the size of a texture, and the number of texels that does."""
     try:
-        if text == "fit":
-            return FIT, 0
+        if text in ("fit", "auto"):
+            return FIT if text == "fit" else AUTOMATIC, 0
         return (DENSITY, float(text[:-2])) if text.endswith("/m") else (RESOLUTION, int(text))
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"'{text}' is no number of texels, nor one a metre like '50/m', "
-                                         "nor 'fit'") from error
+                                         "nor 'fit' or 'auto'") from error
 
 
 def main(argv: Sequence[str]) -> int:

@@ -16,7 +16,19 @@ from .backend.errors import UserError
 from .backend.transfer import Transfer
 from .cli_files import choose, save_file, set_number
 from .ops.batch import Batch, Outcome, finish_batch, prepare_batch
-from .properties import CHEAPEST, COLLECTION, DENSITY, FIT, NETWORK, RAYS, RESOLUTION, TEXTURE, TOLERANCE, VERTICES
+from .properties import (
+    AUTOMATIC,
+    CHEAPEST,
+    COLLECTION,
+    DENSITY,
+    FIT,
+    NETWORK,
+    RAYS,
+    RESOLUTION,
+    TEXTURE,
+    TOLERANCE,
+    VERTICES,
+)
 from .scene.read import make_applied_copy
 from .scene.render import render_preview
 from .scene.views import LIT
@@ -31,8 +43,11 @@ def check_bake(arguments: argparse.Namespace) -> None:
         raise UserError("With --uv-map a texture has no texels per metre; give --texture a number of texels, or fit.")
     if arguments.gloss and (arguments.texture is None or arguments.bounces):
         raise UserError("--gloss belongs to a bake with --texture and without --bounces.")
-    if not methods.METHODS[arguments.method].traces and (arguments.rays is not None or arguments.bounces):
-        raise UserError(f"The method '{arguments.method}' traces nothing; leave out --rays and --bounces.")
+    method = methods.METHODS[arguments.method]
+    if arguments.rays is not None and not method.traces:
+        raise UserError(f"The method '{arguments.method}' takes no number of rays; leave out --rays.")
+    if arguments.bounces and not method.bounces:
+        raise UserError(f"The method '{arguments.method}' follows no light that bounces; leave out --bounces.")
     if arguments.texture is not None and arguments.npz is not None:
         raise UserError("--npz holds the points of a bake to vertices; a texture's are in its .exr files (--textures).")
 
@@ -69,8 +84,8 @@ def prepare_bake(arguments: argparse.Namespace, objects: list[bpy.types.Object],
     settings.lamps = arguments.lamps or arguments.lamps_network
     settings.lamps_by = NETWORK if arguments.lamps_network else CHEAPEST
     if arguments.texture is not None:
-        settings.target = TEXTURE
-        settings.sizing, size = arguments.texture
+        sizing, size = arguments.texture
+        settings.target, settings.sizing = (AUTOMATIC, FIT) if sizing == AUTOMATIC else (TEXTURE, sizing)
         if settings.sizing != FIT:
             set_number(settings, "side" if settings.sizing == RESOLUTION else "texels_per_metre", size)
         set_number(settings, "padding", 2 if arguments.padding is None else arguments.padding)

@@ -29,7 +29,7 @@ from .scene.viewport import follow_viewport
 from .scene.views import COEFFICIENT, LIT, OCCLUSION
 
 RAYS, TOLERANCE, COLLECTION = "RAYS", "TOLERANCE", "COLLECTION"
-VERTICES, TEXTURE = "VERTICES", "TEXTURE"
+AUTOMATIC, VERTICES, TEXTURE = "AUTOMATIC", "VERTICES", "TEXTURE"
 CHEAPEST, PATHS, NETWORK = "CHEAPEST", "PATHS", "NETWORK"
 RESOLUTION, DENSITY, FIT = "RESOLUTION", "DENSITY", "FIT"
 
@@ -124,7 +124,9 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
                 "thousand points, and a network says from them what it is anywhere. For rooms of up to 20 m")])
     target: EnumProperty(  # type: ignore[valid-type]
         name="Target", description="Where the bake is kept", default=VERTICES,
-        items=[(VERTICES, "Vertices", "Numbers at the vertices: quick, and enough for dense meshes"),
+        items=[(AUTOMATIC, "Automatic", "Vertices; where the method is Automatic, too, and vertices would miss shadows "
+                "inside faces by more than the tolerance, a texture as large as these need"),
+               (VERTICES, "Vertices", "Numbers at the vertices: quick, and enough for dense meshes"),
                (TEXTURE, "Texture", "Images with a UV map of their own: fine shadows on large faces, and normal maps")])
     sizing: EnumProperty(  # type: ignore[valid-type]
         name="Size", description="What decides the size of the texture", default=RESOLUTION,

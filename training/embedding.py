@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Train the light-transport embedding: label rooms, then `python -m training.embedding`; writes weights and a log.
 
-As Xu et al. 2026: relative L2, points in space and not pictures. Rooms are neither turned nor moved, as the network
-gives the same for those by construction; each colour channel is a room of its own, and the scene points' light has
-another noise in each of room_labels.LOOKS looks.
+As Xu et al. 2026: relative L2 of logarithms, points in space and not pictures. Rooms are neither turned nor moved, as
+the network gives the same for those by construction; each colour channel is a room of its own, the scene points' light
+has another noise in each of room_labels.LOOKS looks, and each step has some of the points or all.
 """
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from neural_gash_addon.backend import embedding, weights
+from neural_gash_addon.backend import embedding, embedding_bake, weights
 from neural_gash_addon.backend.nearest import nearest_to
 from neural_gash_addon.backend.networks.embedding import FULL, SMALL, Embedding, Frame, Settings, level
 
@@ -27,6 +27,7 @@ from .curves import draw
 
 CACHE = data.CACHE / "rooms"
 EPSILON = 0.1        # of the level: errors below it are mostly noise
+SHARES = 1.0, 0.7, 0.5  # of a room's scene points, of which one is drawn for each step
 HELD_OUT = 1024      # queries of a room, when it is judged
 NAME = "embedding"
 
@@ -39,11 +40,13 @@ class Recipe:
     steps: int
     rate: float
     rooms: int     # of a step
-    queries: int   # of each of them
+    queries: int   # of each of them: 8,192 of a step, as section 4
     every: int     # steps, the held-out rooms are looked at and all is saved
+    goes_on: bool = False  # from the weights that ship, instead of random ones
 
 
-RECIPES = {"small": Recipe(SMALL, 1_600, 1.5e-3, 1, 2048, 100),          # half an hour of one busy CPU core
+RECIPES = {"small": Recipe(SMALL, 1_600, 1.5e-3, 4, 2048, 100),        # an hour of one CPU core
+           "further": Recipe(SMALL, 240, 1e-3, 4, 2048, 80, True),     # a tenth of that
            "full": Recipe(FULL, 200_000, 2e-4, 4, 2048, 2_000)}
 
 
@@ -69,11 +72,13 @@ class Sample:
 
 
 @cache
-def load(path: Path, settings: Settings) -> Sample:
-    """A room of the cache, kept in memory."""
+def load(path: Path, settings: Settings, share: float = 1.0) -> Sample:
+    """A room of the cache with a share of its scene points, kept in memory."""
     with np.load(path) as found:
         points, direct, looks, queries, asked, truth, noise = (found[key] for key in (
             "scene_points", "point_direct", "point_indirect", "queries", "direct", "indirect", "indirect_noise"))
+    first = slice(round(share * len(points)))  # of points in farthest-point order, which are a good sample too
+    points, direct, looks = points[first], direct[first], looks[:, first]
     layout = embedding.layout(points[:, :3], settings.gathered, settings.around)
     near = nearest_to(queries[:, :3], points[:len(layout.around), :3], settings.neighbours)
     return Sample(points, direct, looks, queries, asked, truth, noise, layout, near.astype(np.int32),
@@ -102,13 +107,22 @@ def answer(model: nn.Module, sample: Sample, rows: NDArray, look: int = 0) -> tu
     return found, tensor(sample.truth[rows].T) / unit, tensor(sample.guide[rows].T) / unit
 
 
-def relative(found: Tensor, truth: Tensor, guide: Tensor) -> Tensor:
-    """Relative L2, by what was found and by the guide; no gradient through that, as in Müller et al. 2021.
+def of_logarithms(found: Tensor, truth: Tensor, _: Tensor) -> Tensor:
+    """Equation 12: relative L2 of log(1 + light / level). No gradient through what it is relative to."""
+    logs = found.log1p()
+    return ((logs - truth.log1p()) / (logs.detach() + EPSILON)).square().mean()
 
-    Of values, not of their logarithms as equation 12: the truth is noisy, and least squares of values aim at its mean
-    as long as they are not weighted by it.
+
+def of_values(found: Tensor, truth: Tensor, guide: Tensor) -> Tensor:
+    """Relative L2 of light, by what was found and by the guide; no gradient through that, as in Müller et al. 2021.
+
+    The truth is noisy, and least squares of values aim at its mean as long as they are not weighted by it.
     """
     return ((found - truth).square() / ((found.detach().square() + guide.square()) / 2 + EPSILON)).mean()
+
+
+Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
+LOSSES: dict[str, Loss] = {"logarithms": of_logarithms, "values": of_values}
 
 
 def held_rows(sample: Sample) -> NDArray:
@@ -119,7 +133,7 @@ def held_rows(sample: Sample) -> NDArray:
 def judged(found: NDArray, sample: Sample) -> dict[str, float]:
     """Errors of reflected light (n, 3) at `held_rows`, in each over what they would be of darkness.
 
-    `relative` as it is trained with, without what the truth's own noise is expected to add; squared error over squared
+    `relative` as `of_values`, without what the truth's own noise is expected to add; squared error over squared
     truth, likewise; and that of the logarithm of 1 + light / level, with the noise.
     """
     rows, unit = held_rows(sample), sample.level.clip(1e-30)
@@ -178,18 +192,20 @@ BASELINES: dict[str, Callable[[Sample, NDArray], NDArray]] = {
     **{f"mean of the {count} nearest scene points": nearest_points(count) for count in (16, 64, 256)}}
 
 
-def train(recipe: Recipe, kept: list[Path], held: list[Sample], seed: int, checkpoint: Path, log: Path) -> Embedding:
+def train(recipe: Recipe, kept: list[Path], held: list[Sample], seed: int, checkpoint: Path, log: Path,
+          loss: Loss = of_logarithms) -> Embedding:
     """Train, and write log and checkpoint as we go; on from the checkpoint, where there is one of just this."""
     torch.manual_seed(seed)
-    model = Embedding(recipe.settings).to(loop.device())
+    model = embedding_bake.network() if recipe.goes_on else Embedding(recipe.settings)
+    model = model.to(loop.device())
 
     def loss_of(model: nn.Module, rng: np.random.Generator) -> Tensor:
         losses = []
         for _ in range(recipe.rooms):
-            sample = load(kept[rng.integers(len(kept))], recipe.settings)
+            sample = load(kept[rng.integers(len(kept))], recipe.settings, SHARES[rng.integers(len(SHARES))])
             rows = rng.permutation(len(sample.queries))[:recipe.queries]
             found, *known = answer(model, sample, rows, int(rng.integers(len(sample.looks))))
-            losses.append(relative(found.float(), *known))
+            losses.append(loss(found.float(), *known))
         return torch.stack(losses).mean()
 
     def look(model: nn.Module) -> dict[str, float]:
@@ -215,9 +231,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--configuration", choices=RECIPES, default="small")
     parser.add_argument("--steps", type=int, help="instead of the configuration's")
+    parser.add_argument("--loss", choices=LOSSES, default="logarithms", help="those of values beside equation 12")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cache", type=Path, default=CACHE, help="of labelled rooms, from training.room_labels")
     parser.add_argument("--out", type=Path, default=weights.FOLDER, help="folder of the weights")
+    parser.add_argument("--logs", type=Path, default=Path(__file__).parent / "logs", help="folder of the log")
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # steps are small, and a second thread that must wait loses tenfold
     recipe = RECIPES[arguments.configuration]
@@ -228,8 +246,11 @@ def main() -> None:
     if not kept or not held:
         parser.error(f"there are too few labelled rooms in '{arguments.cache}'; make them with "
                      "`python -m training.room_labels`")
-    log = Path(__file__).parent / "logs" / f"{NAME}.csv"
-    model = train(recipe, kept, held, arguments.seed, arguments.cache / f"{NAME}.checkpoint", log)
+    name = "-".join([NAME, *(each for each in (arguments.configuration, arguments.loss)
+                             if each not in ("small", "logarithms"))])
+    log = arguments.logs / f"{name}.csv"
+    model = train(recipe, kept, held, arguments.seed, arguments.cache / f"{name}.checkpoint", log,
+                  LOSSES[arguments.loss])
     arguments.out.mkdir(parents=True, exist_ok=True)
     weights.save(arguments.out / weights.EMBEDDING,
                  {name: value.cpu().numpy() for name, value in model.state_dict().items()})

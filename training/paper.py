@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Train the paper's networks from nothing: `make data`, then `python -m training.paper --network gnn-paper`.
 
-Each step takes a patch of one mesh, turned and scaled at random; visibility is traced anew, because the directions turn
-with the normals.
+Stage 1 takes all of two meshes in a step, by points spread over them, turned and scaled at random; visibility is traced
+anew, because the directions turn with the normals. Stage 2 and the others take a patch of one.
 """
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 from torch.nn import functional
 
-from neural_gash_addon.backend import conformal, paper_bake, weights
+from neural_gash_addon.backend import conformal, sight, weights
 from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.graph import Graph, graph
 from neural_gash_addon.backend.neighbours import Neighbours
 from neural_gash_addon.backend.networks import paper
 from neural_gash_addon.backend.raycast import Occluders
+from neural_gash_addon.backend.sight import Sight
 
 from . import data, labels, loop
 from .curves import draw
@@ -39,12 +40,22 @@ NETWORKS: dict[str, Callable[[int], nn.Module]] = {
     "visibility": paper.VisibilityNet}
 SHIPPED = ("mlp", "gnn-paper")
 Model = TypeVar("Model", bound=nn.Module)
-STEPS = {"mlp": 3000, "student": 3000, "gnn-paper": 4000, "end-to-end": 2000}
-RATE, PATCH, HELD_OUT, LOOKS = 2e-3, 1500, 0.1, 20
+STEPS = {"mlp": 3000, "student": 3000, "gnn-paper": 2000, "end-to-end": 2000}
+RATE, PATCH, HELD_OUT, LOOKS = 2e-3, 1500, 0.1, 10
+MESHES, OTHERS = 2, 256  # of a step of stage 1, and vertices of each beside those that are heard
+MOST_LOOKED = 1024       # such vertices of a mesh held out
 INNER = 0.6            # of a patch's points count: around the others there is too little of the mesh
 SCALES = (0.8, 1.25)
 MOST_POINTS = 30_000   # of a mesh
 FLOOR = 3e-4  # of the unshadowed energy, as in training.gnn
+
+
+class Look(NamedTuple):
+    """What stage 1 is asked of a mesh."""
+
+    sight: Sight
+    visibility: Tensor  # (m, 25) of those asked
+    free: float         # share of the mesh's rays that are free
 
 
 class Example(NamedTuple):
@@ -53,10 +64,16 @@ class Example(NamedTuple):
     encoded: Tensor     # (n, inputs)
     source: Tensor      # (e,)
     start: Tensor       # (n + 1,)
-    blocked: Tensor     # (n, 9) in world axes
-    visibility: Tensor  # (n, 25)
+    sights: list[Sight]  # what stage 1 is given of the same vertices
+    frames: np.ndarray  # (n, 3, 3) of the motors
+    blocked: Tensor     # (n, 9) in these frames; in the axes of the mesh where that is wanted
+    visibility: Tensor  # (n, 25) as the mesh lies
     inner: Tensor       # (n,) whose neighbours' neighbours are in the patch, too: those count
-    free: float         # share of the mesh's rays that are free
+
+
+def tensors(*arrays: np.ndarray) -> list[Tensor]:
+    """Where the training runs."""
+    return [torch.from_numpy(np.ascontiguousarray(a)).to(loop.device()) for a in arrays]
 
 
 class Source:
@@ -68,42 +85,68 @@ class Source:
         point, other = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
         order = np.argsort(point, kind="stable")
         start = np.searchsorted(point[order], np.arange(len(self.sample.positions) + 1))
-        self.graph = graph(self.sample.positions.astype(np.float64), Neighbours(start, other[order].astype(np.int32)))
+        self.neighbours = Neighbours(start, other[order].astype(np.int32))
+        self.places = sight.places(self.sample.positions, self.sample.normals)
         self.blocked = (self.sample.unshadowed - self.sample.coefficients)[:, :paper.COEFFICIENTS]
-        self.free = float(self.sample.visibility.mean())
         self.lit = np.any(self.sample.normals != 0, axis=1)
+        self.free = float(self.sample.visibility[self.lit].mean())
+
+    @cached_property
+    def graph(self) -> Graph:
+        """Made when the first patch is taken."""
+        return graph(self.sample.positions.astype(np.float64), self.neighbours)
 
     @cached_property
     def scene(self) -> Occluders:
-        """Made when the first patch is turned."""
+        """Made when the mesh is first turned."""
         return Occluders([(self.sample.positions, self.sample.triangles)])
 
-    def example(self, encoding: str, rng: np.random.Generator | None, traced: bool = True) -> Example:
-        """A patch, turned and scaled, with its visibility where it is `traced`; the whole mesh without a generator."""
-        sample = self.sample
-        turn, scale = np.eye(3), 1.0
-        rows, inner = np.arange(len(sample.positions)), np.ones(len(sample.positions), bool)
+    def look(self, encoding: str, rng: np.random.Generator | None) -> Look:
+        """The points that are heard and OTHERS, turned and scaled; as the mesh lies without a generator."""
+        sample, places = self.sample, self.places
+        left = self.lit.copy()
+        left[places.spread] = False
+        others = (rng or np.random.default_rng(0)).permutation(np.flatnonzero(left))
+        rows = np.concatenate([places.spread, others[:OTHERS if rng else MOST_LOOKED]])
+        seen = sample.visibility[rows]
         if rng is not None:
-            turn, scale = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix(), rng.uniform(*SCALES)
+            turn = turned(rng)
+            places = places.turned(turn, rng.uniform(*SCALES))
+            # in the mesh as it lies, along the directions that the turned normals have, turned back
+            directions = np.einsum("nij,dj->ndi", turn.T @ places.frames[rows], sample.directions)
+            origins = self.scene.origins(sample.positions[rows], sample.normals[rows])
+            seen = self.scene.blocked(np.repeat(origins, seen.shape[1], axis=0),
+                                      np.ascontiguousarray(directions.reshape(-1, 3), np.float32)) != 0
+        return Look(Sight(*tensors(*places.sight(rows, ENCODINGS[encoding][1]))),
+                    *tensors(seen.reshape(len(rows), -1).astype(np.float32)), self.free)
+
+    def example(self, encoding: str, rng: np.random.Generator | None, local: bool) -> Example:
+        """A patch, turned and scaled; the whole mesh without a generator. Coefficients are `local` to the motors."""
+        sample, places = self.sample, self.places
+        rows, inner = np.arange(len(sample.positions)), np.ones(len(sample.positions), bool)
+        turn = np.eye(3)
+        if rng is not None:
+            turn = turned(rng)
+            places = places.turned(turn, rng.uniform(*SCALES))
             if len(rows) > PATCH:
                 away = np.square(sample.positions - sample.positions[rng.integers(len(rows))]).sum(1)
                 rows = np.sort(np.argpartition(away, PATCH)[:PATCH])
                 inner = away[rows] <= np.quantile(away[rows], INNER)
-        positions, normals = (a.astype(np.float64) @ turn.T for a in (sample.positions, sample.normals[rows]))
-        blocked = sh.rotate_each(self.blocked[rows], np.broadcast_to(turn, (len(rows), 3, 3)))
-        seen = sample.visibility[rows]
-        if rng is not None and traced:
-            # in the mesh as it lies, along the directions that the turned normals have, turned back
-            frames = turn.T @ labels.motor_frames(normals)
-            directions = np.einsum("nij,dj->ndi", frames, sample.directions)
-            places = self.scene.origins(sample.positions[rows], sample.normals[rows])
-            seen = self.scene.blocked(np.repeat(places, seen.shape[1], axis=0),
-                                      np.ascontiguousarray(directions.reshape(-1, 3), np.float32)) != 0
-        encoded = ENCODINGS[encoding][1](scale * paper_bake.placed(positions, self.lit)[rows], normals)
+        frames = places.frames[rows]
+        blocked = sh.rotate_each(self.blocked[rows],
+                                 frames.transpose(0, 2, 1) @ turn if local else np.broadcast_to(turn, frames.shape))
+        encode = ENCODINGS[encoding][1]
         edges = within(self.graph, rows)
-        return Example(*(torch.from_numpy(np.ascontiguousarray(a)).to(loop.device()) for a in (
-            encoded.astype(np.float32), edges.source, edges.start, blocked.astype(np.float32),
-            seen.reshape(len(rows), -1).astype(np.float32), inner)), self.free)
+        encoded, source, start, blocked, seen, inner = tensors(
+            encode(places.points[rows], places.normals[rows]).astype(np.float32), edges.source, edges.start,
+            blocked.astype(np.float32), sample.visibility[rows].astype(np.float32), inner)
+        return Example(encoded, source, start, [Sight(*tensors(*places.sight(rows, encode)))], frames, blocked,
+                       seen, inner)
+
+
+def turned(rng: np.random.Generator) -> np.ndarray:
+    """A rotation (3, 3), any as likely as any other."""
+    return Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
 
 
 def within(edges: Graph, rows: np.ndarray) -> Graph:
@@ -130,15 +173,27 @@ def shadow_loss(found: Tensor, truth: Tensor) -> Tensor:
 
 
 def loss_of(model: nn.Module, example: Example, teacher: nn.Module | None = None) -> Tensor:
-    """What is minimised of coefficients; a student follows its teacher, too (section 4.1.1)."""
-    found = model(example.encoded, example.source, example.start)
-    found = (found[0] if isinstance(found, tuple) else found)[example.inner]
+    """What is minimised of coefficients; a student, whose are in the axes of the mesh, follows its teacher, too
+    (section 4.1.1)."""
+    found = answer(model, example)[0][example.inner]
     loss = shadow_loss(found, example.blocked[example.inner])
     if teacher is None:
         return loss
     with torch.no_grad():
-        target, _ = teacher(example.encoded, example.source, example.start)
+        target, _ = answer(teacher, example)
+    target, = tensors(sh.rotate_each(target.cpu().numpy(), example.frames).astype(np.float32))
     return loss + shadow_loss(found, target[example.inner])
+
+
+def is_local(model: nn.Module) -> bool:
+    """Whether a network's coefficients are in the motors' frames; the perceptron's are in the axes of the mesh."""
+    return not isinstance(model, paper.Mlp)
+
+
+def answer(model: nn.Module, example: Example) -> tuple[Tensor, Tensor | None]:
+    """What a network says of the blocked part, and of the visibility where it has two stages."""
+    graph_ = (example.encoded, example.source, example.start)
+    return model(*graph_, example.sights) if isinstance(model, paper.TwoStage) else (model(*graph_), None)
 
 
 def evaluate(model: nn.Module, held: list[Source], encoding: str) -> dict[str, float]:
@@ -146,11 +201,10 @@ def evaluate(model: nn.Module, held: list[Source], encoding: str) -> dict[str, f
     ratios, accuracies = [], []
     with torch.no_grad():
         for source in held:
-            example = source.example(encoding, None)
-            found = model(example.encoded, example.source, example.start)
-            if isinstance(found, tuple):
-                accuracies.append(accuracy(found[1] > 0, example.visibility > 0.5))
-                found = found[0]
+            example = source.example(encoding, None, is_local(model))
+            found, logits = answer(model, example)
+            if logits is not None:
+                accuracies.append(accuracy(logits > 0, example.visibility > 0.5))
             energy = example.blocked.square().sum().clamp_min(1e-9)
             ratios.append(float((found - example.blocked).square().sum() / energy))
     out = {"srr_median": float(np.median(ratios)), "srr_mean": float(np.mean(ratios))}
@@ -163,12 +217,11 @@ def accuracy(found: Tensor, truth: Tensor) -> float:
     return float(right[truth].mean() + right[~truth].mean()) / 2
 
 
-def misjudged(model: nn.Module, held: list[Source], encoding: str) -> dict[str, float]:
-    """Share of rays that stage 1 gets wrong, balanced, on whole meshes."""
+def misjudged(model: paper.VisibilityNet, held: list[Source], encoding: str) -> dict[str, float]:
+    """Share of rays that stage 1 gets wrong, balanced."""
     found = []
-    for example in (source.example(encoding, None) for source in held):
-        logits = model(example.encoded, example.source, example.start)
-        found.append(1 - accuracy(logits > 0, example.visibility > 0.5))
+    for look in (source.look(encoding, None) for source in held):
+        found.append(1 - accuracy(model.ask(look.sight) > 0, look.visibility > 0.5))
     return {"misjudged": float(np.nanmean(found)), "worst": float(np.nanmax(found))}
 
 
@@ -176,10 +229,10 @@ def train(network: str, encoding: str, seed: int, kept: list[Source], held: list
           checkpoint: Path, teacher: nn.Module | None = None) -> nn.Module:
     """Train, and write log and checkpoint as we go; on from the checkpoint, where there is one of just this.
 
-    Two stages are trained one after the other, the first with twice the steps, each of which costs less.
+    Two stages are trained one after the other.
     """
-    def drawn(rng: np.random.Generator, traced: bool) -> Example:
-        return kept[rng.integers(len(kept))].example(encoding, rng, traced)
+    def drawn(rng: np.random.Generator) -> Source:
+        return kept[rng.integers(len(kept))]
 
     def fit(model: Model, loss: loop.Loss, look: loop.Look, steps: int, stage: str = "") -> Model:
         return loop.run(model, loss, look, steps=steps, rate=RATE, every=max(1, steps // LOOKS), seed=seed,
@@ -187,10 +240,9 @@ def train(network: str, encoding: str, seed: int, kept: list[Source], held: list
                         log=log.with_name(f"{log.stem}{stage}.csv"))
 
     def fit_stage_1(model: Model, steps: int, stage: str = "") -> Model:
-        def seen(model: nn.Module, rng: np.random.Generator) -> Tensor:
-            example = drawn(rng, traced=True)
-            logits = model(example.encoded, example.source, example.start)
-            return balanced(logits[example.inner], example.visibility[example.inner], example.free)
+        def seen(model: paper.VisibilityNet, rng: np.random.Generator) -> Tensor:
+            looks = [drawn(rng).look(encoding, rng) for _ in range(MESHES)]
+            return torch.stack([balanced(model.ask(each.sight), each.visibility, each.free) for each in looks]).mean()
 
         return fit(model, seen, lambda model: misjudged(model, held, encoding), steps, stage)
 
@@ -199,9 +251,9 @@ def train(network: str, encoding: str, seed: int, kept: list[Source], held: list
     if isinstance(model, paper.VisibilityNet):
         return fit_stage_1(model, steps)
     if isinstance(model, paper.TwoStage):
-        model.visibility = fit_stage_1(model.visibility, 2 * steps, "-visibility")
+        model.visibility = fit_stage_1(model.visibility, steps, "-visibility")
         model.visibility.requires_grad_(False)
-    return fit(model, lambda model, rng: loss_of(model, drawn(rng, traced=False), teacher),
+    return fit(model, lambda model, rng: loss_of(model, drawn(rng).example(encoding, rng, is_local(model)), teacher),
                lambda model: evaluate(model, held, encoding), steps)
 
 

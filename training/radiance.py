@@ -36,7 +36,7 @@ PATHS = 64  # as many as a scene point has
 @cache
 def trained() -> nn.Module:
     """The embedding that ships."""
-    return embedding_bake.network().requires_grad_(False)
+    return embedding_bake.network().to(loop.device()).requires_grad_(False)
 
 
 class Room:

@@ -26,16 +26,16 @@ from tqdm import tqdm
 from neural_gash_addon.backend import irradiance, methods, sampling
 from neural_gash_addon.backend.errors import UserError
 from neural_gash_addon.backend.exchange import write_npz
-from neural_gash_addon.backend.lit_points import POINTS, REFLECTED, lit_points
+from neural_gash_addon.backend.lit_points import REFLECTED, lit_points
 from neural_gash_addon.backend.lit_scene import LitScene
 from neural_gash_addon.backend.raycast import Occluders
 
 from . import data, rooms
 
-VERSION = 3            # raised whenever the same job gives other labels
+VERSION = 4            # raised whenever the same job gives other labels
 CACHE = data.CACHE / "rooms"
 TRAIN, VALIDATION, EVALUATION = "train", "validation", "evaluation"
-TRAIN_RAYS, VALIDATION_RAYS = 512, 2048  # for reflected light
+TRAIN_RAYS, VALIDATION_RAYS = 1024, 2048  # for reflected light
 DIRECT_RAYS = 256      # for light straight from emitters
 QUERIES = 2048
 LOOKS = 4              # independent ones at the light of the scene points, so that their noise is not learned by heart
@@ -57,7 +57,7 @@ class Job:
     seed: int
     split: str
     rays: int
-    points: int = POINTS
+    points: int | None = None     # of the scene; by its surfaces where it is None
     queries: int = QUERIES
     files: tuple[Path, ...] = ()  # of meshes that may stand in it
     source: Path | None = None    # the file of a scene that is not generated
@@ -77,14 +77,15 @@ class Outcome(NamedTuple):
     problem: str  # empty where it went well
 
 
-def jobs(count: int, split: str, rays: int, points: int = POINTS, queries: int = QUERIES,
+def jobs(count: int, split: str, rays: int, points: int | None = None, queries: int = QUERIES,
          files: Sequence[Path] = ()) -> list[Job]:
     """The first rooms of a split."""
     first = _FIRST[split]
     return [Job(seed, split, rays, points, queries, tuple(files)) for seed in range(first, first + count)]
 
 
-def evaluation(count: int, folder: Path | None, rays: int, points: int = POINTS, queries: int = QUERIES) -> list[Job]:
+def evaluation(count: int, folder: Path | None, rays: int, points: int | None = None, queries: int = QUERIES
+               ) -> list[Job]:
     """The Cornell box, the first rooms of the split, and the scenes of a folder, see `rooms.read`."""
     sources = sorted(folder.glob("*.npz")) if folder else []
     return [Job(CORNELL, EVALUATION, rays, points, queries), *jobs(count, EVALUATION, rays, points, queries),
@@ -129,7 +130,7 @@ def visible_points(scene: LitScene, count: int, seed: int, occluders: Occluders)
     return np.concatenate(found)[:count]
 
 
-def label(scene: LitScene, *, seed: int, split: str, rays: int, points: int = POINTS, queries: int = QUERIES,
+def label(scene: LitScene, *, seed: int, split: str, rays: int, points: int | None = None, queries: int = QUERIES,
           threads: int | None = 1) -> dict[str, NDArray]:
     """A scene as the network wants it, by KEYS. Metres, linear RGB, W/m^2.
 
@@ -204,12 +205,12 @@ def prepare(wanted: Sequence[Job], cache: Path = CACHE, workers: int = 2, quiet:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line. 1 where a room could not be labelled."""
     parser = argparse.ArgumentParser(prog="python -m training.room_labels", description=__doc__)
-    parser.add_argument("--rooms", type=int, default=160, help="to train on")
+    parser.add_argument("--rooms", type=int, default=220, help="to train on")
     parser.add_argument("--validation", type=int, default=16, help="rooms to validate with")
     parser.add_argument("--evaluation", type=int, default=8, help="rooms to evaluate with, beside the Cornell box")
     parser.add_argument("--rays", type=int, default=TRAIN_RAYS, help="from each point of a room to train on")
     parser.add_argument("--validation-rays", type=int, default=VALIDATION_RAYS)
-    parser.add_argument("--points", type=int, default=POINTS, help="scene points of a room")
+    parser.add_argument("--points", type=int, help="scene points of a room, instead of by its surfaces")
     parser.add_argument("--queries", type=int, default=QUERIES, help="points of a room at which the light is known")
     parser.add_argument("--meshes", type=Path, help="folder of meshes that may stand in the rooms")
     parser.add_argument("--scenes", type=Path, help="folder of scenes to evaluate with, beside the Cornell box")

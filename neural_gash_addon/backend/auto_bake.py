@@ -10,17 +10,22 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from . import advice
+from . import spherical_harmonics as sh
 from .bands import Bands, all_of, of_open_sky
 from .geometry import TriangleMesh
+from .merged import SAFE, Merged, dense, merged
 from .pilot import Pilot, look
-from .plan import Plan, choose, choose_bands, nothing_blocks, traced_bands
+from .plan import Plan, cheapest, nothing_blocks, traced_bands, unshadowed, unshadowed_bands
 from .progress import scaled
 from .raycast import Geometry, Occluders
 from .transfer import Transfer
 from .workers import default_threads
 
 _PILOT_SHARE = 0.05  # of the progress
+_ROUGH = 0.05    # a tolerance that a look at a merged mesh is exact enough for
 _MANY = 1 << 18  # points that are baked at a time, where those that are looked at are but some of them
 
 
@@ -32,6 +37,7 @@ class Planned:
     scene: Occluders | None
     pilot: Pilot | None  # of the order that is baked; None: nothing was traced
     bands: Bands
+    merged: Merged | None = None  # what was looked at instead of the scene
 
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None, occluders: Sequence[Geometry],
@@ -54,10 +60,16 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     error, probes = record.error_estimate, record.probe_rays
     if plan.method == "analytic":
         error = pilot.blocked if pilot is not None else 0.0
-    if pilot is not None and tolerance is not None and found.scene is not None:
-        asking = advice.inside_faces(mesh, found.scene, transfer.coefficients, order, tolerance, seed,
-                                     threads or default_threads())
-        record = record.also((yield from scaled(asking, 1, 0)))
+    if pilot is not None and tolerance is not None:
+        seen, scene, corners = mesh, found.scene, transfer.coefficients
+        if found.merged:
+            seen, scene = found.merged.surface(), found.merged.scene
+            corners = sh.cosine_lobe(seen.normals, order).astype(np.float32)
+        assert scene is not None
+        asking = advice.inside_faces(seen, scene, corners, order, tolerance, seed, threads or default_threads())
+        inside = yield from scaled(asking, 1, 0)
+        if inside is not None:
+            record = replace(record, between_error=inside).also(advice.said(inside, tolerance))
     if pilot is not None:
         probes += pilot.traced
     return Transfer(transfer.coefficients, replace(record, probe_rays=probes, seconds=time.perf_counter() - began,
@@ -76,14 +88,27 @@ def planned(mesh: TriangleMesh, order: int, rays: int | None, tolerance: float |
     if tolerance is None:
         return Planned(Plan("embree", rays=rays, reason="A number of rays was asked for: they are traced from every "
                                                         "point."), scene, None, every)
-    threads = threads or default_threads()
-    if scene is None:
-        scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
+    threads, points, enough = threads or default_threads(), len(mesh.points), tolerance
+
+    def without_rays(found: Pilot, safe: float = 1.0) -> tuple[Plan, Bands] | None:
+        if not whole:
+            return unshadowed_bands(found, order, enough, safe)
+        plan = unshadowed(found, enough, safe)
+        return (plan, every) if plan else None
+
+    def with_rays(found: Pilot) -> tuple[Plan, Bands]:
+        return (cheapest(found, points, enough), every) if whole else traced_bands(found, points, order, enough)
+
     with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+        few = merged(mesh, occluders) if scene is None and tolerance >= _ROUGH and dense(mesh, occluders) else None
+        if few:
+            rough = yield from look(few.mesh, few.scene, order, tolerance, seed, pool, threads)
+            if chosen := without_rays(rough, SAFE):
+                return Planned(chosen[0], None, rough.to_order(chosen[1].order), chosen[1], few)
+        if scene is None:
+            scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
         pilot = yield from look(mesh, scene, order, tolerance, seed, pool, threads)
-    if whole:
-        return Planned(choose(pilot, len(mesh.points), tolerance), scene, pilot, every)
-    plan, bands = choose_bands(pilot, len(mesh.points), order, tolerance)
+    plan, bands = (None if few else without_rays(pilot)) or with_rays(pilot)
     return Planned(plan, scene, pilot if bands.order == order else pilot.to_order(bands.order), bands)
 
 

@@ -35,6 +35,7 @@ LEFT_OUT = 0.3        # of a tolerance: what bounces may be that are left out, a
 _FALL = 0.5, 0.95     # from one bounce to the next, at least (where but one is known) and at most
 BLACK = "Everything is black: no bounce is computed."
 _RAYS_AT_ONCE = 1 << 17
+_FRONTS = 0.9         # of the progress: each further round of backs has so much of what is left
 _SETS = 16
 
 
@@ -57,20 +58,26 @@ class Reflection:
         began = time.perf_counter()
         order = transfer.record.order
         planned = transfer.record.tolerance if transfer.record.plan else None
-        if self.solution is None:
-            parts = [(mesh.positions, mesh.triangles), *occluders]
-            self.solution = Bounces(parts, self.albedo, scene, order, self.seed, threads, pictures=self.pictures)
-            yield from self.solution.solve(self.bounces, allowed=None if planned is None else LEFT_OUT * planned)
+        allowed = None if planned is None else LEFT_OUT * planned
+        solution = yield from self.solved(mesh, occluders, scene, order, threads, allowed)
         transfer = Transfer(transfer.coefficients, transfer.record.also(self._why()))
-        if not self.solution.used:
+        if not solution.used:
             return transfer
         rays = int(np.clip(transfer.record.rays_per_point, MIN_RAYS, MAX_RAYS))
-        bounced = yield from self.solution.gather(mesh, rays)
-        record = replace(transfer.record, bounces=self.solution.used, colours=3,
+        bounced = yield from solution.gather(mesh, rays)
+        record = replace(transfer.record, bounces=solution.used, colours=3,
                          rays=transfer.record.rays + rays * len(mesh.points),
                          seconds=transfer.record.seconds + time.perf_counter() - began)
         return Transfer(transfer.coefficients[:, :, None] + bounced, record)
 
+    def solved(self, mesh: TriangleMesh, occluders: Sequence[Geometry], scene: Occluders, order: int,
+               threads: int | None, allowed: float | None = None) -> Generator[float, None, Bounces]:
+        """The solution, made the first time; arguments as `add` and `Bounces.solve`. Yields progress."""
+        if self.solution is None:
+            parts = [(mesh.positions, mesh.triangles), *occluders]
+            self.solution = Bounces(parts, self.albedo, scene, order, self.seed, threads, pictures=self.pictures)
+            yield from self.solution.solve(self.bounces, allowed=allowed)
+        return self.solution
 
     @property
     def black(self) -> bool:
@@ -169,9 +176,10 @@ class Bounces:
             list(pool.map(part, range(0, len(self.met), step)))
         return out
 
-    def gather(self, mesh: TriangleMesh, rays: int) -> Generator[float, None, NDArray[np.float32]]:
+    def gather(self, mesh: TriangleMesh, rays: int, seed: int = 0) -> Generator[float, None, NDArray[np.float32]]:
         """What bounces bring to the points of a mesh: (N, K, 3), to be added to their direct transfer.
 
+        seed: of the points' rays, beside that of the patches.
         Yields:
             Progress, 0 to 1. Closing the generator stops the workers.
         """
@@ -179,11 +187,11 @@ class Bounces:
         out = np.zeros((len(mesh.points), terms, 3), np.float32)
         if not self.used or not self._leaving.any():
             return out
-        rng = np.random.default_rng([self._seed, 3])
+        rng = np.random.default_rng([self._seed, 3, *([seed] if seed else [])])
         sets = sampling.hemisphere_sets(_SETS, rays, int(rng.integers(2**31)))
         which, angles = rng.integers(0, _SETS, len(mesh.points)), rng.uniform(0, 2 * np.pi, len(mesh.points))
         padded = np.concatenate([self._leaving, np.zeros((1, 3 * terms), np.float32)])
-        lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+        lit = mesh.lit()
         step = max(1, _RAYS_AT_ONCE // rays)
 
         def part(points: NDArray) -> None:
@@ -197,7 +205,7 @@ class Bounces:
 
     def trace(self) -> Generator[float, None, None]:
         """Trace all fronts, and then the backs that were met, until no new ones are."""
-        fresh = 2 * np.arange(self.patches.count)
+        fresh, done = 2 * np.arange(self.patches.count), 0.0
         while len(fresh):
             self._row[fresh] = len(self.direct) + np.arange(len(fresh))
             sides = np.full((len(fresh), PATCH_RAYS), -1, np.int64)
@@ -213,7 +221,8 @@ class Bounces:
                 sides[rows], direct[rows], ways[rows] = self._traced(fresh[rows], np.random.default_rng(seed))
 
             for share in spread(part, list(zip(parts, seeds, strict=True)), self._threads):
-                yield 0.5 * share
+                yield 0.5 * (done + _FRONTS * (1 - done) * share)
+            done += _FRONTS * (1 - done)
             self.met = np.concatenate([self.met, sides.astype(np.int32)])
             self.direct = np.concatenate([self.direct, direct])
             self.directions = np.concatenate([self.directions, ways])

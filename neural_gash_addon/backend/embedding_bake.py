@@ -7,6 +7,7 @@ But in gaps between things that are narrower than its codes are apart, it is tra
 """
 from __future__ import annotations
 
+import logging
 from collections.abc import Generator
 from typing import Any
 
@@ -31,25 +32,26 @@ STRAIGHT = 128                  # paths for light straight from emitters: what t
 QUERIES_AT_ONCE = 4096          # decoded together, so that memory does not grow with their number
 CHECKED, CHECKS = 128, 1024     # points whose reflected light is traced as well, to know the error; paths of each
 ENCLOSED = 512                  # paths for reflected light at points in gaps, where the network is not asked
+_LOGGER = logging.getLogger(__name__)
 
 
 def network() -> Any:
-    """The trained network: networks.embedding.Embedding, on the GPU where there is one, in `eval` mode.
+    """The trained network: networks.embedding.Embedding of the configuration that was trained, in `eval` mode.
 
     Raises:
         UserError: no torch, or no weights, or not those that were trained.
     """
     torch = import_torch("embedding")
-    from .networks.embedding import SMALL, Embedding
+    from .networks.embedding import FULL, SMALL, Embedding
 
-    model = Embedding(SMALL)
     arrays = weights.load(weights.FOLDER / weights.EMBEDDING)
+    model = Embedding(FULL if len(arrays["encoder.leave.weight"]) == FULL.width else SMALL)
     model.load_state_dict({key: torch.from_numpy(array.copy()) for key, array in arrays.items()})
-    return model.to("cuda" if torch.cuda.is_available() else "cpu").eval()
+    return model.eval()
 
 
 def radiance_network(model: Any) -> Any:
-    """The trained radiance decoder that reads the codes of `network()`: networks.radiance.Radiance, likewise.
+    """The trained radiance decoder, for the codes of `network()`, the model: networks.radiance.Radiance, likewise.
 
     Raises:
         UserError: no weights, or not those that were trained.
@@ -61,12 +63,14 @@ def radiance_network(model: Any) -> Any:
     decoder = Radiance(model.settings)
     arrays = weights.load(weights.FOLDER / weights.RADIANCE)
     decoder.load_state_dict({key: torch.from_numpy(array.copy()) for key, array in arrays.items()})
-    return decoder.to(next(model.parameters()).device).eval()
+    return decoder.eval()
 
 
 def encoded(scene: LitScene, *, seed: int = 0, threads: int | None = None, occluders: Occluders | None = None,
             directions: bool = False) -> Generator[float, None, Room | None]:
     """A scene's room, to be asked by `irradiance` any number of times; None where no surface has an area.
+
+    On the GPU, where there is one with enough memory.
 
     Args:
         directions: it can be asked for light by direction, too.
@@ -78,7 +82,16 @@ def encoded(scene: LitScene, *, seed: int = 0, threads: int | None = None, occlu
     decoder = radiance_network(model) if directions else None
     lit = yield from lit_points(scene, occluders or scene.occluders(), seed=seed, threads=threads,
                                 order=0 if decoder is None else decoder.order)
-    return Room(model, lit, decoder) if len(lit.places) else None
+    if not len(lit.places):
+        return None
+    torch = import_torch("embedding")
+    if torch.cuda.is_available():
+        try:
+            return Room(model, lit, decoder, "cuda")
+        except torch.cuda.OutOfMemoryError:
+            _LOGGER.warning("The GPU has too little memory for this room; its processor does the work.")
+            torch.cuda.empty_cache()
+    return Room(model, lit, decoder)
 
 
 def irradiance(scene: LitScene, points: NDArray, normals: NDArray, *, seed: int = 0, threads: int | None = None,
@@ -96,7 +109,7 @@ def irradiance(scene: LitScene, points: NDArray, normals: NDArray, *, seed: int 
         of the points: one share of all values; at those in gaps (`enclosed`), by their paths.
     Raises:
         UserError: no torch or weights, points that are not finite, or a room larger than the network knows.
-        ValueError: a higher order than the network's.
+        ValueError: a higher order than the network's, or any of a room that was encoded without directions.
     """
     if order > sh.MAX_ORDER:
         raise ValueError(f"order {order} is above {sh.MAX_ORDER}, which the network was trained with")
@@ -158,11 +171,11 @@ def refuse_larger(places: NDArray) -> None:
 class Room:
     """A room's codes, which answer for any point."""
 
-    def __init__(self, model: Any, points: LitPoints, radiance: Any = None) -> None:
+    def __init__(self, model: Any, points: LitPoints, radiance: Any = None, device: str = "cpu") -> None:
         """Encode at least one point.
 
         Args:
-            model: networks.embedding.Embedding, on its device, in `eval` mode.
+            model: networks.embedding.Embedding in `eval` mode, moved to the device.
             radiance: networks.radiance.Radiance, likewise, where light by direction is asked; of its order are the
                 points' shapes.
         """
@@ -170,7 +183,8 @@ class Room:
 
         from .networks.embedding import Frame, level
 
-        self.model, self.radiance, self._where = model, radiance, next(model.parameters()).device
+        self.model, self._where = model.to(device), device
+        self.radiance: Any = None if radiance is None else radiance.to(device)
         sizes = model.settings
         self._centre = np.mean(points.places, axis=0, dtype=np.float64)
         self._layout = embedding.layout(points.places, sizes.gathered, sizes.around)
@@ -201,9 +215,13 @@ class Room:
             points: (N, 3) metres. normals: (N, 3) unit; where it is zero, so is the light.
             direct: (N, 3) light straight from emitters.
             order: bands, at most those of `radiance`; 0 for none.
+        Raises:
+            ValueError: an order, where it was encoded without `radiance`.
         """
         import torch
 
+        if order and self.radiance is None:
+            raise ValueError("this room was encoded without directions, so it has no light by direction")
         out, unit = np.zeros((len(points), 3), np.float32), self.level[:, None]
         shape, terms = np.zeros((len(points), order * order, 3), np.float32), order * order
         for start in range(0, len(points), QUERIES_AT_ONCE):

@@ -39,7 +39,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     count = len(mesh.points)
     coefficients = np.zeros((count, sh.coefficient_count(order)), dtype=np.float32)
     rays_of_point = np.zeros(count, dtype=np.int32)
-    lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+    lit = mesh.lit()
     lit = lit[morton_order(mesh.points[lit])] if len(lit) else lit
     most = MAX_RAYS if rays is None else rays
     estimator = BlockedEstimator(mesh, scene, order, seed, most)

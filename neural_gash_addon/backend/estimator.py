@@ -38,22 +38,26 @@ class BlockedEstimator:
     """Sums of Y_k over blocked rays, in each point's local frame."""
 
     def __init__(self, mesh: TriangleMesh, occluders: Occluders, order: int, seed: int, rays: int, sets: int = SETS,
-                 twins: bool = False) -> None:
+                 twins: bool = False, spare: bool = False) -> None:
         """rays: the most that any point will take. seed: independent seeds give independent estimates.
 
-        sets: fewer cost less where points are few, whose errors are then less independent. twins: there will be some,
-        and as many sets for them.
+        sets: fewer cost less where points are few, whose errors are then less independent. twins: the second half of
+        the points is the first again, whose errors have to be independent: none has the set of its twin. spare: as
+        many sets more are made, for `apart`.
         """
         rng = np.random.default_rng([seed, 0])
         self._occluders = occluders
         self._order = order
-        self._sets_each, self._count = sets, 2 * sets if twins else sets
+        self._sets_each, self._count = sets, 2 * sets if spare else sets
         self._most, self._scramble = rays, int(rng.integers(2**31))
         self._made = np.zeros((self._count, 0, 3))  # directions so far: most bakes stop long before the most rays
         self._points, self._clearance = mesh.points, mesh.clearance
         self._normals = mesh.normals
         self._angles = rng.uniform(0, 2 * np.pi, len(mesh.points)).astype(np.float32)
         self._set_of_point = rng.integers(0, sets, len(mesh.points), dtype=np.uint8)
+        if twins:
+            first, second = np.split(self._set_of_point, 2)
+            second[:] = (first + rng.integers(1, sets, len(second), dtype=np.uint8)) % sets
         self._excess: dict[tuple[int, int], NDArray] = {}
         self._evaluated: tuple[tuple[int, int], NDArray] | None = None  # of which directions, and their harmonics
 
@@ -61,16 +65,18 @@ class BlockedEstimator:
         """Make the directions 0..stop now, and what is known of them."""
         self._harmonics(0, stop)
 
-    def twins(self, points: NDArray, rng: np.random.Generator) -> BlockedEstimator:
-        """Of some of the points (n,), numbered anew: an estimate by other nets, independent of this one.
+    def apart(self, points: NDArray, rng: np.random.Generator) -> BlockedEstimator:
+        """Of some of the points (n,), and of the same again (2n), by the spare nets: independent of this one.
 
-        One that was made with `twins`, and `rng` must be independent of its seed. What was prepared is shared.
+        Neither has the set of its twin. `rng` must be independent of the seed. What was prepared is shared.
         """
+        twice = np.tile(points, 2)
         out = copy.copy(self)
-        out._points, out._clearance, out._normals = (
-            a[points] for a in (self._points, self._clearance, self._normals))
-        out._angles = rng.uniform(0, 2 * np.pi, len(points)).astype(np.float32)
-        out._set_of_point = rng.integers(self._sets_each, self._count, len(points), dtype=np.uint8)
+        out._points, out._clearance, out._normals = (a[twice] for a in (self._points, self._clearance, self._normals))
+        out._angles = rng.uniform(0, 2 * np.pi, len(twice)).astype(np.float32)
+        first = rng.integers(0, self._sets_each, len(points), dtype=np.uint8)
+        second = (first + rng.integers(1, self._sets_each, len(points), dtype=np.uint8)) % self._sets_each
+        out._set_of_point = np.concatenate([first, second]) + np.uint8(self._sets_each)
         out._excess = {}
         return out
 

@@ -68,6 +68,11 @@ class TriangleMesh:
     texels: NDArray[np.int64] | None = None   # (N,) of TEXEL: row * side + column, rising
     side: int = 0                             # of TEXEL: texels a side
 
+    def lit(self) -> NDArray[np.int64]:
+        """(n,) points that have a normal, rising."""
+        x, y, z = self.normals.T  # not any(1): NumPy is slow along short last axes
+        return np.flatnonzero((x != 0) | (y != 0) | (z != 0))
+
     @staticmethod
     def from_corners(positions: NDArray, triangles: NDArray, corner_vertices: NDArray, corner_normals: NDArray,
                      corner_faces: NDArray, resolution: float | None = None, corners: NDArray | None = None,

@@ -94,7 +94,7 @@ class GlossyBounces:
         rng = np.random.default_rng([self._seed, 4])
         sets = sampling.hemisphere_sets(_SETS, rays, int(rng.integers(2**31)))
         which, angles = rng.integers(0, _SETS, len(mesh.points)), rng.uniform(0, 2 * np.pi, len(mesh.points))
-        lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+        lit = mesh.lit()
         step = max(1, _RAYS_AT_ONCE // rays)
 
         def part(points: NDArray) -> None:

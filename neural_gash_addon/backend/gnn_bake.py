@@ -34,7 +34,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
         yield _BUILDING
     voxels = scene
     coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
-    lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+    lit = mesh.lit()
     lit = lit[morton_order(mesh.points[lit])] if len(lit) else lit
     done = 0
 

@@ -56,7 +56,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     threads = threads or default_threads()
     if scene is None:
         scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
-    lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+    lit = mesh.lit()
     network = load_hybrid() if len(lit) >= FEWEST else None
     last = MAX_RAYS if rays is None else rays if network else max(rays, min(2 * rays, MOST_DOUBLED))
     coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
@@ -109,7 +109,7 @@ def at_once(mesh: TriangleMesh, occluders: Sequence[Geometry], order: int, rays:
     coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
     threads = default_threads()
     with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
-        lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+        lit = mesh.lit()
         if len(lit):
             work = _Work(mesh, scene, order, seed, rays, lit, pool, threads, load_hybrid())
             coefficients[work.lit] = work.unshadowed - run(work.trace(0, rays))[1]
@@ -155,7 +155,7 @@ class _Work:
         if tolerance is not None:
             self._sample_size, self._sample_rays = sample_size(count), pilot_rays(tolerance)
         self.probes = 2 * self._sample_size * self._sample_rays
-        self._estimator = BlockedEstimator(mesh, scene, order, seed, max(rays, self._sample_rays), twins=True)
+        self._estimator = BlockedEstimator(mesh, scene, order, seed, max(rays, self._sample_rays), spare=True)
         self._estimator.prepare(self._sample_rays)  # once for both
 
     def trace(self, start: int, stop: int) -> Generator[float, None, tuple[NDArray[np.float32], NDArray[np.float32]]]:
@@ -183,7 +183,7 @@ class _Work:
         """Some of the points (s,), and two independent traces (s, K) of their blocked part; on the calling thread."""
         rng = np.random.default_rng([self._seed, 1])
         points = np.sort(rng.choice(len(self.lit), self._sample_size, replace=False))
-        twins = self._estimator.twins(np.tile(self.lit[points], 2), rng)  # each sees a net of its own
+        twins = self._estimator.apart(self.lit[points], rng)
         rows = np.arange(2 * len(points))
         sums = twins.summed(rows, 0, self._sample_rays)
         one, two = np.split(twins.turned_here(rows, twins.means(rows, sums, 0, self._sample_rays)), 2)

@@ -17,6 +17,7 @@ from . import embedding_bake
 from .errors import UserError
 from .geometry import TriangleMesh
 from .irradiance import BATCHES, Irradiance, irradiance
+from .lit_points import count_of
 from .lit_scene import LitScene
 from .progress import scaled
 from .raycast import Occluders
@@ -26,8 +27,8 @@ from .transfer import Transfer
 _PILOT = 0.1    # of the progress
 _SAFELY = 1.05  # times the paths that the error asks for, which is an estimate
 FEWEST, MOST = 32, 4096  # paths from a point, to begin with and where the tolerance is not met before
-# What the network takes, in paths: for a room and for measuring its error, and at each point (docs/embedding.md).
-_ROOM, _POINT = 540_000, 80
+# What the network takes, in paths: for measuring its error, at each scene point, and at each point (docs/embedding.md).
+_MEASURED, _SCENE_POINT, _POINT = 130_000, 100, 80
 _WORTH = 2      # times what it takes have to be saved, as it may turn out to be no good
 _BEST = 0.04    # relative error below which it has been in no room
 _TRIAL = 512    # points at which it is tried
@@ -128,7 +129,8 @@ class Lamps:
         """Whether to try the network, if so many paths from each of so many points are still missing."""
         assert self.tolerance is not None
         # the room counts even where it is there: what a tile is baked by shall not hang on those before it
-        return self.tolerance >= _BEST and points > _TRIAL and paths * points > _WORTH * (_ROOM + _POINT * points)
+        room = _MEASURED + _SCENE_POINT * count_of(self.scene)
+        return self.tolerance >= _BEST and points > _TRIAL and paths * points > _WORTH * (room + _POINT * points)
 
     def _traced(self, mesh: TriangleMesh, seed: int, threads: int | None) -> Generator[float, None, Found]:
         """By paths.

@@ -14,7 +14,8 @@ from .progress import scaled
 from .raycast import Occluders
 from .scene_points import scene_points
 
-POINTS = 4096      # of a room
+DENSITY = 32       # points to a square metre of surface: about 0.18 m apart
+FEWEST, MOST = 4096, 12_288  # of a room
 STRAIGHT = 64      # paths for light that comes straight from emitters, of which hardly any noise is left
 REFLECTED = 64     # paths for light that was reflected: noisy at one point, and not over a neighbourhood
 
@@ -33,18 +34,25 @@ class LitPoints:
     shape: Floats | None = None  # (M, K, 3) where asked: the same by direction, see `irradiance.Irradiance`
 
 
-def lit_points(scene: LitScene, occluders: Occluders, count: int = POINTS, paths: int = REFLECTED, *, seed: int = 0,
-               threads: int | None = None, order: int = 0) -> Generator[float, None, LitPoints]:
+def count_of(scene: LitScene) -> int:
+    """How many scene points a scene has: by the area of its surfaces, so that they are as close in large rooms."""
+    area = float(scene.areas[:len(scene.areas) - scene.bodiless].sum())
+    return round(min(max(DENSITY * area, FEWEST), MOST))
+
+
+def lit_points(scene: LitScene, occluders: Occluders, count: int | None = None, paths: int = REFLECTED, *,
+               seed: int = 0, threads: int | None = None, order: int = 0) -> Generator[float, None, LitPoints]:
     """Points on the surfaces of a scene, lit. Where a front is dark and its back is not, the point is of its back.
 
     Rooms are often modelled with normals outwards; what is solid is dark inside.
 
     Args:
-        count: of points. paths: from each, for reflected light. order: bands of `shape`; 0 for none.
+        count: of points; `count_of` the scene where it is None. paths: from each, for reflected light. order: bands
+            of `shape`; 0 for none.
     Yields:
         Progress, 0 to 1.
     """
-    points = scene_points(scene, count, seed)
+    points = scene_points(scene, count or count_of(scene), seed)
     places, normals = points[:, :3], points[:, 3:6].copy()
 
     def traced(rows: NDArray) -> Generator[float, None, tuple[Floats, Floats, Floats]]:

@@ -101,7 +101,7 @@ class Live:
         fewest rays up to the first that take longer than `seconds`. Some of them always are.
         """
         rng = np.random.default_rng([self._seed, 3])
-        sample = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+        sample = mesh.lit()
         sample = np.sort(rng.permutation(sample)[:_SAMPLE])
         few = replace(mesh, points=mesh.points[sample], normals=mesh.normals[sample],
                       clearance=mesh.clearance[sample])

@@ -37,11 +37,17 @@ class Method:
     name: str
     label: str
     description: str
-    traces: bool  # takes rays or a tolerance, and follows bounces
+    traces: bool  # takes rays or a tolerance, and has bounces added to what it gives
     bake: Callable[..., Baking]
     # what makes of a mesh and its occluders what the method sees of them; None: it sees no shadows
     sees: Callable[[TriangleMesh, Sequence[Geometry]], Any] | None = None
     plans: bool = False  # to a tolerance, the order is the most that it bakes
+    reflects: bool = False  # takes a `reflection`, and follows bounces itself
+
+    @property
+    def bounces(self) -> bool:
+        """Whether light can bounce in its bakes."""
+        return self.traces or self.reflects
 
 
 def _analytic(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
@@ -83,9 +89,9 @@ METHODS: dict[str, Method] = {m.name: m for m in (
            traces=False, bake=gnn_bake.bake, sees=gnn_bake.voxels_of),
     Method("embedding", "Embedding (PyTorch)", "Traces rays at some thousand points of the surface, and a network says "
            "from them what blocks the light anywhere; what a point costs does not grow with the scene", traces=False,
-           bake=sky_bake.bake, sees=sky_bake.encoded),
+           bake=sky_bake.bake, sees=sky_bake.encoded, reflects=True),
     Method("gnn-paper", "Paper's network (PyTorch)", "The two-stage graph network of Neural-GASh, for comparison: "
-           "shadows of what is near along the surface", traces=False, bake=paper_bake.bake_gnn),
+           "no rays; soft shadows of the mesh on itself", traces=False, bake=paper_bake.bake_gnn),
     Method("gnn-paper-ao", "Paper's network with AO (PyTorch)", "The same, darkened where neighbours stand above the "
            "surface", traces=False, bake=paper_bake.bake_gnn_ao),
     Method("mlp", "Paper's perceptron (PyTorch)", "The first version of Neural-GASh, for comparison: each point by "
@@ -108,7 +114,7 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
             point). A method that traces wants exactly one of the two.
         occluders: what else blocks, parts (positions (V, 3), triangles (F, 3)) in the same frame.
         scene: mesh and occluders as the method `sees` them, where they are there already from another bake.
-        reflection: light that bounces, if any shall; for methods that trace.
+        reflection: light that bounces, if any shall; for methods with `bounces`.
         lamps: what lights the points besides, if anything shall.
         seed: independent seeds give independent errors. threads: one a core where not given.
         whole: all bands, whatever a plan says: for what must be alike in several bakes.
@@ -123,10 +129,10 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
     entry = METHODS[method]
     direct = partial(entry.bake, mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed,
                      threads=threads, **({"whole": whole} if entry.plans else {}))
-    if reflection is None or not entry.traces:
+    if reflection is None or not entry.bounces:
         baking = direct(scene=scene)
     else:
-        baking = _with_bounces(direct, mesh, occluders, scene, threads, reflection)
+        baking = _with_bounces(entry, direct, mesh, occluders, scene, threads, reflection)
     return baking if lamps is None else _with_lamps(baking, mesh, lamps, seed, threads)
 
 
@@ -145,12 +151,14 @@ def check(method: str, order: int, rays: int | None, tolerance: float | None) ->
             raise UserError(f"The tolerance must be {MIN_TOLERANCE:g} to 1, not {tolerance:g}.")
 
 
-def _with_bounces(direct: Callable[..., Baking], mesh: TriangleMesh, occluders: Sequence[Geometry],
-                  scene: Occluders | None, threads: int | None, reflection: Reflection) -> Baking:
+def _with_bounces(entry: Method, direct: Callable[..., Baking], mesh: TriangleMesh, occluders: Sequence[Geometry],
+                  scene: Any, threads: int | None, reflection: Reflection) -> Baking:
     """A bake of direct transfer, and then what bounces add to it; where nothing can bounce, nothing is looked at."""
     if reflection.black or (mesh.domain != TEXEL and nothing_blocks(mesh, occluders)):  # tiles must be alike
         found = yield from direct(scene=scene)
         return Transfer(found.coefficients, found.record.also(BLACK if reflection.black else _FREE))
+    if entry.reflects:
+        return (yield from direct(scene=scene, reflection=reflection))
     if scene is None:
         scene = _embree_scene(mesh, occluders)
     transfer = yield from scaled(direct(scene=scene), 0, 0.6)

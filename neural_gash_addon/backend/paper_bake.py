@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import conformal, weights
+from . import sight, weights
 from . import spherical_harmonics as sh
 from .errors import UserError
 from .geometry import TEXEL, TriangleMesh
@@ -25,7 +25,6 @@ from .transfer import Transfer
 from .workers import default_threads
 
 ORDER = 3   # bands that the paper's networks give
-SIDE = 8.0  # of what they are given: neighbours, a hundredth of a mesh apart, are then told apart as normals are
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -37,19 +36,6 @@ def import_torch(method: str) -> Any:
         raise UserError(f"The method '{method}' needs PyTorch, which this Python has not; get it with "
                         f"'{sys.executable} -m pip install torch', or choose another method.") from error
     return torch
-
-
-def placed(points: NDArray, lit: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Points (N, 3) as the networks know them: box of those that are `lit` centred on the origin, longest side SIDE."""
-    seen = points[lit] if lit.any() else points
-    low, high = seen.min(0), seen.max(0)
-    return (points - (low + high) / 2) * (SIDE / (float((high - low).max()) or 1.0))
-
-
-def encoded(mesh: TriangleMesh) -> NDArray[np.float32]:
-    """What the networks are given of a mesh's points: (N, 32)."""
-    lit = np.any(mesh.normals != 0, axis=1)
-    return conformal.encode(placed(mesh.points, lit), mesh.normals).astype(np.float32)
 
 
 def _bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
@@ -69,12 +55,13 @@ def _bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float 
     name = "mlp" if method == "mlp" else "gnn-paper"
     arrays = weights.load(weights.FOLDER / f"{name}.safetensors")
     lit = np.any(mesh.normals != 0, axis=1)
-    seen = encoded(mesh)
+    seen = sight.encode(sight.placed(mesh.points, lit), mesh.normals)
     yield 0.1
+    known = None if name == "mlp" else sight.places(mesh.points, mesh.normals)
     edges = (graph(mesh.points, neighbours(mesh)) if name != "mlp"
              else Graph(np.zeros(len(lit) + 1, np.int64), np.zeros(0, np.int64)))
     yield 0.4
-    ask = partial(_answer, torch, name, arrays, seen, edges)
+    ask = partial(_answer, torch, arrays, seen, edges, known)
     before = torch.get_num_threads()
     torch.set_num_threads(threads or default_threads())
     try:
@@ -85,7 +72,8 @@ def _bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float 
         blocked = ask("cpu")
     finally:
         torch.set_num_threads(before)
-    coefficients = sh.cosine_lobe(mesh.normals, order) - blocked[:, :sh.coefficient_count(order)]
+    world = blocked if known is None else sh.rotate_each(blocked, known.frames)
+    coefficients = sh.cosine_lobe(mesh.normals, order) - world[:, :sh.coefficient_count(order)]
     if method == "gnn-paper-ao":
         coefficients = refined(coefficients, mesh.points, mesh.normals, edges)
     coefficients[~lit] = 0
@@ -94,17 +82,22 @@ def _bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float 
         seconds=time.perf_counter() - began, error_estimate=None))
 
 
-def _answer(torch: Any, name: str, arrays: dict[str, NDArray[np.float32]], seen: NDArray[np.float32],
-            edges: Graph, device: str) -> NDArray[np.float32]:
-    """The blocked part (N, 9)."""
+def _answer(torch: Any, arrays: dict[str, NDArray[np.float32]], seen: NDArray[np.float32], edges: Graph,
+            known: sight.Places | None, device: str) -> NDArray[np.float32]:
+    """The blocked part (N, 9), in the motors' frames; without places that of the perceptron, in the mesh's axes."""
     from .networks import paper
 
-    network = paper.Mlp() if name == "mlp" else paper.TwoStage()
+    def given(*arrays: NDArray) -> list[Any]:
+        return [torch.from_numpy(array).to(device) for array in arrays]
+
+    network = paper.Mlp() if known is None else paper.TwoStage()
     network.load_state_dict({key: torch.from_numpy(array.copy()) for key, array in arrays.items()})
     network.to(device).eval()
+    given_ = given(seen, edges.source, edges.start)
     with torch.no_grad():
-        found = network(*(torch.from_numpy(array).to(device) for array in (seen, edges.source, edges.start)))
-        return (found if name == "mlp" else found[0]).cpu().numpy()
+        if known is None:
+            return network(*given_).cpu().numpy()
+        return network(*given_, (sight.Sight(*given(*part)) for part in known.sights()))[0].cpu().numpy()
 
 
 bake_mlp = partial(_bake, method="mlp")

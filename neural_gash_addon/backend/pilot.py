@@ -24,7 +24,7 @@ POINTS = 256                  # or a 16th of them all, if that is less; or a 256
 _FEWEST, _MOST = 128, 2048
 _NOISE, _NOISE_RAYS = 0.035, 64  # the noise of so many rays is no more on most meshes
 _LEAST_RAYS, _MOST_RAYS = 16, 128
-_SETS = 4
+_SETS = 8
 _UNEVEN = 1.1                 # of the noise of rays that are no power of two, and so no whole net, to that of such
 _BESIDES = 4.0                # what a point costs besides its rays, in rays
 _DARK = 1e-3                  # of the transfer in the open: less than this is as good as none
@@ -85,24 +85,29 @@ class Pilot:
 def look(mesh: TriangleMesh, scene: Occluders, order: int, tolerance: float, seed: int, pool: ThreadPoolExecutor,
          threads: int) -> Generator[float, None, Pilot]:
     """Trace a few points twice, with rays whose noise is about the tolerance. Yields progress."""
-    lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+    lit = mesh.lit()
     rng = np.random.default_rng([seed, 5])
     wanted = sample_size(len(lit))
     points = np.sort(rng.choice(lit, wanted, replace=False))
     few = replace(mesh, points=mesh.points[points], normals=mesh.normals[points], clearance=mesh.clearance[points])
     rays = pilot_rays(tolerance)
     unshadowed = sh.cosine_lobe(few.normals, order)
-    rows, found = np.arange(wanted), []
     began = time.perf_counter()
-    for _ in range(2):
-        twin = BlockedEstimator(few, scene, order, int(rng.integers(2**31)), rays, _SETS)
-        sums = np.zeros_like(unshadowed)
-        yield from twin.trace(pool, threads, rows, 0, rays, sums)
-        found.append(twin.turned_here(rows, twin.means(rows, sums, 0, rays)))
-    spent = time.perf_counter() - began
-    ray = spent / (2 * (rays + _BESIDES) * max(wanted, 1))
-    one, two = found
+    one, two = yield from twice(few, scene, order, rays, int(rng.integers(2**31)), pool, threads)
+    ray = (time.perf_counter() - began) / (2 * (rays + _BESIDES) * max(wanted, 1))
     return _said((points, one, two), unshadowed, rays, ray, 2 * rays * wanted)
+
+
+def twice(few: TriangleMesh, scene: Occluders, order: int, rays: int, seed: int, pool: ThreadPoolExecutor, threads: int
+          ) -> Generator[float, None, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """The blocked part (n, K) of the points of a mesh, twice, with independent rays. Yields progress."""
+    rows = np.tile(np.arange(len(few.points)), 2)  # at once: what a trace costs at all is much, where points are few
+    of = replace(few, points=few.points[rows], normals=few.normals[rows], clearance=few.clearance[rows])
+    twins, every = BlockedEstimator(of, scene, order, seed, rays, _SETS, twins=True), np.arange(len(rows))
+    sums = np.zeros((len(rows), sh.coefficient_count(order)))
+    yield from twins.trace(pool, threads, every, 0, rays, sums)
+    one, two = np.split(twins.turned_here(every, twins.means(every, sums, 0, rays)), 2)
+    return one, two
 
 
 def _said(sample: tuple[NDArray, NDArray, NDArray], unshadowed: NDArray, rays: int, ray: float, traced: int) -> Pilot:

@@ -3,7 +3,8 @@
 
 1. Where everything lies below the tangent plane of every point, nothing can be blocked: unshadowed transfer is exact,
    and neither a ray nor a scene is needed. A convex mesh is so.
-2. Else a pilot says how large shadows are, and what rays bring and cost (`pilot`).
+2. Else a pilot says how large shadows are, and what rays bring and cost (`pilot`). Where the scene that it traces would
+   take longer than it may, the mesh is merged first to see whether shadows are wanted at all (`merged`).
 3. Bands whose energy would not be seen are dropped (`bands`); the rest of the tolerance is for the others.
 4. Each candidate is given a number of rays that meets the tolerance, and a time; the cheapest is taken. What the noise
    becomes with other rays, and what a hybrid or a sparse bake saves, follow laws measured on meshes (below).
@@ -23,7 +24,7 @@ from .bands import Bands
 from .embree_bake import FIRST_RAYS
 from .estimator import morton_order
 from .geometry import TriangleMesh
-from .hybrid_bake import expected_rays
+from .hybrid_bake import FEWEST, expected_rays
 from .pilot import Pilot
 from .raycast import Geometry, used
 from .workers import product
@@ -58,10 +59,10 @@ def nothing_blocks(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> bool:
     """
     parts = [(mesh.positions, mesh.triangles), *((p, t) for p, t in occluders if len(t))]
     vertices = np.concatenate([np.asarray(p, np.float64)[used(p, t)] for p, t in parts])
-    lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+    lit = mesh.lit()
     points, normals = mesh.points[lit], mesh.normals[lit]
     # a handful first: almost every mesh is found out by them
-    level = _LEVEL * float(np.ptp(vertices, axis=0).max())
+    level = _LEVEL * max(float(np.ptp(axis)) for axis in vertices.T)
     some, few = points[::len(points) // 32 + 1], vertices[::len(vertices) // 4096 + 1]
     height = normals[::len(points) // 32 + 1]
     if (product(height, few.T).max(1, initial=-np.inf) > (height * some).sum(1) + level).any():
@@ -87,28 +88,29 @@ def nothing_blocks(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> bool:
     return True
 
 
-def choose_bands(found: Pilot, points: int, order: int, tolerance: float) -> tuple[Plan, Bands]:
-    """The cheapest plan for so many points that meets the tolerance (relative L2) with up to so many bands, and these.
+def unshadowed_bands(found: Pilot, order: int, tolerance: float, safe: float = 1.0) -> tuple[Plan, Bands] | None:
+    """Unshadowed transfer, if that is near enough, at the lowest order at which that and what is dropped are.
 
-    Where unshadowed is near enough, at the lowest order at which that and what is dropped are.
+    safe: what that error may be larger by.
     """
     for fewer in range(bands.LEAST_ORDER, order + 1):
-        if found.without_shadows(fewer)[1] <= tolerance:
+        if safe * found.without_shadows(fewer)[1] <= tolerance:
             return _unshadowed(found.to_order(fewer)), bands.chosen(fewer, order, tolerance, _parts(found, order))
-    return traced_bands(found, points, order, tolerance)
+    return None
 
 
 def traced_bands(found: Pilot, points: int, order: int, tolerance: float) -> tuple[Plan, Bands]:
-    """As `choose_bands`, where shadows are not looked at as a whole: the fewest bands that take no more time than all.
+    """The cheapest plan for so many points that meets the tolerance (relative L2) by tracing, and its bands.
 
-    Noise goes with the bands, so that the others mostly need fewer rays, though less of the tolerance is left for them.
+    These are the fewest of the order that take no more time than all. Noise goes with the bands, so that the others
+    mostly need fewer rays, though less of the tolerance is left for them.
     """
     parts = _parts(found, order)
-    every = choose(found, points, tolerance)
+    every = cheapest(found, points, tolerance)
     for fewer in range(bands.LEAST_ORDER, order):
         if parts[fewer][1] <= bands.MOST_DROPPED * tolerance:
             enough, cut = bands.chosen(fewer, order, tolerance, parts), found.to_order(fewer)
-            plan = choose(cut, points, enough.left, tolerance)
+            plan = cheapest(cut, points, enough.left, tolerance)
             if seconds(plan, cut, points) <= seconds(every, found, points):
                 return plan, enough
     return every, bands.chosen(order, order, tolerance, parts)
@@ -118,10 +120,13 @@ def _parts(found: Pilot, order: int) -> list[tuple[float, float]]:
     return [found.beyond(fewer) for fewer in range(order)]
 
 
-def choose(found: Pilot, points: int, tolerance: float, asked: float | None = None) -> Plan:
-    """The cheapest plan for so many points that meets the tolerance (relative L2), which is what is left of another."""
-    if found.most_blocked <= tolerance:
-        return _unshadowed(found)
+def unshadowed(found: Pilot, tolerance: float, safe: float = 1.0) -> Plan | None:
+    """Unshadowed transfer, if that is near enough, all bands of it; safe: what its error may be larger by."""
+    return _unshadowed(found) if safe * found.most_blocked <= tolerance else None
+
+
+def cheapest(found: Pilot, points: int, tolerance: float, asked: float | None = None) -> Plan:
+    """The cheapest that traces; the tolerance is what is left of another, if one was asked for."""
     candidates = [(seconds(plan, found, points), plan) for plan in plans(found, points, tolerance, asked)]
     return min(candidates, key=lambda candidate: candidate[0])[1]
 
@@ -140,8 +145,9 @@ def plans(found: Pilot, points: int, tolerance: float, asked: float | None = Non
     if enough:
         out.append(Plan("embree", rays=enough[0], reason=f"Shadows are {_percent(found.blocked)} of the whole, so "
                         f"{enough[0]} rays a point are enough for {said}."))
-    out.append(Plan("hybrid", tolerance=tolerance, reason="Few rays, averaged over neighbours by the network, are the "
-                                                          f"quickest way to {said}."))
+    if points >= FEWEST:  # with fewer it asks no network, and what it does without takes longer than plain rays
+        out.append(Plan("hybrid", tolerance=tolerance, reason="Few rays, averaged over neighbours by the network, are "
+                                                              f"the quickest way to {said}."))
     if points >= SPARSE_POINTS:
         out.append(Plan("sparse", tolerance=measured, reason=f"{points:,} points are dense: some are traced, and the "
                                                               "others read off them."))

@@ -18,6 +18,7 @@ from . import methods
 from . import spherical_harmonics as sh
 from .errors import UserError
 from .geometry import Surface, TriangleMesh
+from .pilot import pilot_rays
 from .progress import scaled
 from .raster import Coverage, Layout
 from .raycast import Geometry, Occluders
@@ -27,7 +28,7 @@ from .unwrap import Charts, lay_out
 TRIALS = (32, 64, 128, 256, 512, 1024, 2048)  # texels a side
 MAX_FIT = 4096                    # the largest texture that an error asks for
 _POINTS = 4096                    # of the surface that are looked at
-_RAYS = 256                       # from each and from its texels, for each of two traces
+_TIMES = 2                        # the rays of a pilot, from each and from its texels, for each of two traces
 _LEAST_RATE, _MOST_RATE = 0.5, 2.0  # powers of the size by which an error falls: at a shadow's edge, where smooth
 _DARK = 1e-3                      # of the transfer in the open: less than this on the whole is not seen
 _STEP = 16                        # texels to which sizes are rounded up
@@ -55,7 +56,8 @@ def fitting_side(surface: Surface, uv: NDArray, *, error: float, method: str = "
     scene = None
     if methods.METHODS[method].sees:
         scene = Occluders([(points.positions, points.triangles), *occluders], points.resolution)
-    trace = partial(_traced, method=method, order=order, scene=scene, seed=seed, threads=threads)
+    trace = partial(_traced, method=method, order=order, scene=scene, seed=seed, threads=threads,
+                    rays=_TIMES * pilot_rays(error))
     yield 0.0
     exact = trace(points, first=0)
     dark = _DARK ** 2 * float(np.square(sh.cosine_lobe(points.normals, order)).sum())
@@ -119,11 +121,11 @@ def _nearest(coverage: Coverage, texels: NDArray[np.int64]) -> NDArray[np.int64]
 
 
 def _traced(points: TriangleMesh, *, method: str, order: int, scene: Occluders | None, seed: int, threads: int | None,
-            first: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+            rays: int, first: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Two traces (n, K) of the same points, with seeds of their own; `first` numbers them."""
-    rays = _RAYS if scene is not None else None
     plain = "embree" if scene is not None else method  # a sample has no neighbours to learn from
-    one, two = (methods.run(methods.bake(points, plain, order, rays=rays, scene=scene, threads=threads,
+    one, two = (methods.run(methods.bake(points, plain, order, rays=rays if scene is not None else None, scene=scene,
+                                         threads=threads,
                                          seed=int(np.random.SeedSequence([seed, 1, first + n]).generate_state(1)[0])))
                 for n in range(2))
     return one.coefficients.astype(np.float64), two.coefficients.astype(np.float64)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from . import embedding, sampling, weights
 from . import spherical_harmonics as sh
+from .bounce import Bounces, Reflection
 from .estimator import BlockedEstimator, morton_order
 from .geometry import CORNER, TEXEL, TriangleMesh
 from .hybrid import FULL
@@ -31,9 +32,10 @@ from .workers import default_threads
 
 POINTS, RAYS = 4096, 64        # scene points at least, and rays from each: noisy at one, and not over a neighbourhood
 MOST, ASKING = 16_384, 4       # and at most: one for so many points that ask, so that they are not most of the work
+BOUNCE_RAYS = 64               # from each scene point, for what bounces bring
 CHECKED, CHECKS = 128, 64      # points that are traced twice to know the error; rays of each
 QUERIES_AT_ONCE = 4096         # decoded together, so that memory does not grow with their number
-_ENCODING = 0.3                # of the progress
+_ENCODING, _REFLECTING = 0.3, 0.3  # of the progress
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -45,6 +47,7 @@ class ScenePoints:
     normals: NDArray[np.float32]  # (M, 3) unit, of faces
     blocked: NDArray[np.float32]  # (M, K), traced: see `split`
     rays: int                     # from each
+    surface: TriangleMesh | None = None  # they, in the axes of the bake: for what bounces
 
 
 def split(blocked: NDArray, normals: NDArray) -> NDArray[np.float32]:
@@ -112,7 +115,7 @@ def scene_points(mesh: TriangleMesh, occluders: Occluders, count: int = POINTS, 
     points = on_surface(mesh, count, seed)
     blocked = yield from traced(points, occluders, sh.MAX_ORDER, rays, seed, threads or default_threads())
     return ScenePoints(in_scale(points.points, occluders), points.normals.astype(np.float32),
-                       split(blocked, points.normals), rays)
+                       split(blocked, points.normals), rays, points)
 
 
 def in_scale(places: NDArray, occluders: Occluders) -> NDArray[np.float32]:
@@ -132,6 +135,18 @@ def network() -> Any:
     return model.eval()
 
 
+def reflecting() -> Any:
+    """The trained decoder of what bounces: networks.reflected.Reflected, in `eval` mode. Raises as `network`."""
+    torch = import_torch("embedding")
+    from .networks.embedding import SMALL
+    from .networks.reflected import Reflected
+
+    model = Reflected(SMALL)
+    arrays = weights.load(weights.FOLDER / weights.BOUNCES)
+    model.load_state_dict({key: torch.from_numpy(array.copy()) for key, array in arrays.items()})
+    return model.eval()
+
+
 class Sky:
     """A scene's codes, which answer for any point."""
 
@@ -145,12 +160,13 @@ class Sky:
         self._model, self._device = model.to(device), device
         sizes = model.settings
         layout = embedding.layout(points.places, sizes.gathered, sizes.around)
-        self._places = points.places
+        self._places, self._surface = points.places, points.surface
         parents = nearest_to(points.places, points.places[:len(layout.around)], 1)[:, 0]
         self._frame = Frame.of(self._tensor(points.places), self._tensor(points.normals), layout)
         with torch.no_grad():
-            self._codes = model.encoder(self._frame, self._tensor(points.blocked),
-                                        torch.from_numpy(parents).to(device))
+            self._parents = torch.from_numpy(parents).to(device)
+            self._codes = model.encoder(self._frame, self._tensor(points.blocked), self._parents)
+        self._bounced: tuple[Bounces, Any, Any] | None = None  # the solution, the decoder, and its codes
 
     def spent(self) -> int:
         """Rays that the scene points took, the first time that it is asked: several bakes may share them."""
@@ -159,16 +175,58 @@ class Sky:
 
     def blocked(self, points: NDArray, normals: NDArray, order: int) -> NDArray[np.float32]:
         """Blocked part (n, K) at points (n, 3) with unit normals."""
+        return self._blocked(self._asked(points, normals), normals, order)
+
+    def transfer(self, points: NDArray, normals: NDArray, order: int, solution: Bounces | None
+                 ) -> NDArray[np.float32]:
+        """Transfer (n, K) at points (n, 3) with unit normals; (n, K, 3) with the bounces of a solution `seen`."""
+        asked = self._asked(points, normals)
+        direct = (sh.cosine_lobe(normals, order) - self._blocked(asked, normals, order)).astype(np.float32)
+        return direct if solution is None else direct[:, :, None] + self._brought(asked, solution)
+
+    def seen(self, solution: Bounces) -> Generator[float, None, None]:
+        """Trace what the bounces of a solution bring to the scene points, the first time. Yields progress.
+
+        Raises:
+            UserError: weights that are not those that were shipped.
+        """
+        import torch
+
+        if self._bounced is not None and self._bounced[0] is solution:
+            return
+        assert self._surface is not None, "scene points that are traced know where they are"
+        model = reflecting().to(self._device)
+        bounced = yield from solution.gather(self._surface, BOUNCE_RAYS)
+        with torch.no_grad():
+            codes = model.encode(self._codes, self._frame, self._tensor(bounced), self._parents)
+        self._bounced = solution, model, codes
+        self._rays += BOUNCE_RAYS * len(self._places)
+
+    def _brought(self, asked: tuple[Any, Any, Any], solution: Bounces) -> NDArray[np.float32]:
+        """What bounces bring (n, K, 3)."""
+        import torch
+
+        assert self._bounced is not None and self._bounced[0] is solution
+        with torch.no_grad():
+            found: NDArray[np.float32] = self._bounced[1](self._bounced[2], self._frame, *asked).cpu().numpy()
+        return found
+
+    def _asked(self, points: NDArray, normals: NDArray) -> tuple[Any, Any, Any]:
+        """What decoders want to know of points: places, normals, and the scene points near them."""
+        import torch
+
+        places = in_scale(points, self.occluders)
+        near = torch.from_numpy(nearest_to(places, self._places, self._model.settings.neighbours)).to(self._device)
+        return self._tensor(places), self._tensor(normals), near
+
+    def _blocked(self, asked: tuple[Any, Any, Any], normals: NDArray, order: int) -> NDArray[np.float32]:
         import torch
 
         from .networks.sky import Codes
 
-        places, terms = in_scale(points, self.occluders), order * order
-        near = torch.from_numpy(nearest_to(places, self._places, self._model.settings.neighbours)).to(self._device)
-        codes = Codes(self._codes.values[:, :terms], self._codes.key, self._codes.value)
+        codes = Codes(self._codes.values[:, :order * order], self._codes.key, self._codes.value)
         with torch.no_grad():
-            found = self._model.decoder(codes, self._frame, self._tensor(places), self._tensor(normals), near)
-        found = found.cpu().numpy()
+            found = self._model.decoder(codes, self._frame, *asked).cpu().numpy()
         found[:, 0] = np.clip(found[:, 0], 0, FULL)
         return joined(found, normals)
 
@@ -206,8 +264,11 @@ def _encode(scene: Occluders, mesh: TriangleMesh, seed: int, threads: int) -> Ge
 
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None, occluders: Sequence[Geometry],
-         seed: int, threads: int | None, scene: Sky | None = None) -> Generator[float, None, Transfer]:
+         seed: int, threads: int | None, scene: Sky | None = None, reflection: Reflection | None = None
+         ) -> Generator[float, None, Transfer]:
     """Ask the embedding at every point; arguments as `methods.bake`. Rays and tolerance do not matter.
+
+    With a reflection, bounces are solved once (`bounce`), traced at the scene points, and asked for like the rest.
 
     Raises:
         UserError: no torch, or weights that are not those that were shipped.
@@ -222,37 +283,57 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
         if sky is None:
             built = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
             sky = yield from scaled(_encode(built, mesh, seed, threads), 0.0, _ENCODING)
-        coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
-        lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+        ready, solution = _ENCODING, None
+        if reflection is not None and sky is not None:
+            ready = _ENCODING + _REFLECTING
+            solving = reflection.solved(mesh, occluders, sky.occluders, order, threads)
+            solution = yield from scaled(solving, _ENCODING, 0.8 * _REFLECTING)
+            if solution.used:
+                yield from scaled(sky.seen(solution), ready - 0.2 * _REFLECTING, 0.2 * _REFLECTING)
+            else:
+                solution = None
+        colours = () if solution is None else (3,)
+        coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order), *colours), np.float32)
+        lit = mesh.lit()
         lit = lit[morton_order(mesh.points[lit])] if len(lit) else lit
         for start in range(0, len(lit), QUERIES_AT_ONCE):
             rows = lit[start:start + QUERIES_AT_ONCE]
-            coefficients[rows] = sh.cosine_lobe(mesh.normals[rows], order)
-            if sky is not None:
-                coefficients[rows] -= sky.blocked(mesh.points[rows], mesh.normals[rows], order)
-            yield _ENCODING + (1 - _ENCODING) * (start + len(rows)) / len(lit)
+            points, normals = mesh.points[rows], mesh.normals[rows]
+            coefficients[rows] = (sh.cosine_lobe(normals, order) if sky is None
+                                  else sky.transfer(points, normals, order, solution))
+            yield ready + (1 - ready) * (start + len(rows)) / len(lit)
         error, checked = None, np.random.default_rng([seed, 15]).permutation(lit)[:CHECKED]
         if sky is not None:
-            error = yield from scaled(_error(mesh, sky.occluders, checked, coefficients, seed, threads), 1, 0)
+            checking = _error(mesh, sky.occluders, checked, coefficients, seed, threads, solution)
+            error = yield from scaled(checking, 1, 0)
     finally:
         torch.set_num_threads(before)
     return Transfer(coefficients, BakeRecord(
         method="embedding", order=order, points=len(mesh.points), domain=mesh.domain,
-        rays=sky.spent() if sky is not None else 0,
+        rays=sky.spent() if sky is not None else 0, bounces=solution.used if solution is not None else 0,
+        colours=3 if solution is not None else 1,
         probe_rays=2 * CHECKS * len(checked) if sky is not None else 0, seed=seed, seconds=time.perf_counter() - began,
         error_estimate=error))
 
 
-def _error(mesh: TriangleMesh, occluders: Occluders, rows: NDArray, coefficients: NDArray, seed: int, threads: int
-           ) -> Generator[float, None, float | None]:
-    """Relative L2 error at some points, by two independent traces, whose noise cancels in the product."""
+def _error(mesh: TriangleMesh, occluders: Occluders, rows: NDArray, coefficients: NDArray, seed: int, threads: int,
+           solution: Bounces | None) -> Generator[float, None, float | None]:
+    """Relative L2 error at some points, by two independent traces, whose noise cancels in the product.
+
+    It counts what bounces, too, as that is learned; but for the error of its solution, which is the same in both.
+    """
     order, few = sh.order_of(coefficients.shape[1]), replace(
         mesh, points=mesh.points[rows], normals=mesh.normals[rows], clearance=mesh.clearance[rows])
     truth = []
     for number in range(2):
         own = int(np.random.SeedSequence([seed, 16, number]).generate_state(1)[0])
         blocked = yield from scaled(traced(few, occluders, order, CHECKS, own, threads), number / 2, 1 / 2)
-        truth.append(sh.cosine_lobe(few.normals, order) - blocked)
+        direct = sh.cosine_lobe(few.normals, order) - blocked
+        if solution is None:
+            truth.append(direct)
+            continue
+        bounced = yield from scaled(solution.gather(few, CHECKS, own), (number + 1) / 2, 0)
+        truth.append(direct[:, :, None] + bounced)
     squared = float(((coefficients[rows] - truth[0]) * (coefficients[rows] - truth[1])).sum())
     energy = float((truth[0] * truth[1]).sum())
     return float(max(squared, 0.0) / energy) ** 0.5 if energy > 0 else None

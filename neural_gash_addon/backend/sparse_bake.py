@@ -59,7 +59,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     threads = threads or default_threads()
     if scene is None:
         scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
-    lit = np.flatnonzero(np.any(mesh.normals != 0, axis=1))
+    lit = mesh.lit()
     coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
     spent = 0
     if len(lit) >= _LEAST_STRIDE * FEWEST:

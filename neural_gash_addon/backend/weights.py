@@ -21,6 +21,7 @@ from .hybrid import Layer, Network
 
 FOLDER = Path(__file__).parent / "networks"
 HYBRID, GNN, SKY = "hybrid.safetensors", "gnn.safetensors", "sky.safetensors"
+BOUNCES = "bounces.safetensors"  # reads the codes of SKY
 EMBEDDING, RADIANCE = "embedding.safetensors", "radiance.safetensors"  # the latter reads the codes of the former
 CHECKSUMS = "checksums.json"  # file name -> SHA-256, beside the weights
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import bpy
 
 from ..backend import methods
+from ..backend.advice import missed, said
 from ..backend.atlas import Placed, place
 from ..backend.errors import UserError
 from ..backend.progress import scaled
@@ -23,7 +24,7 @@ from ..scene.lamps import LitScenes
 from .job import Job, check, finish, prepare, size
 from .lamps import LampReader
 
-_PLACING = 0.1  # of the progress
+_PLACING, _LOOKING = 0.1, 0.2  # of the progress
 Result = Transfer | TextureTransfer | UserError
 
 
@@ -95,7 +96,8 @@ def _bake(jobs: list[Job], shared: bool, sizes: dict) -> Generator[float, None, 
         done, spent = _PLACING, (time.perf_counter() - began) / len(jobs)
         bakes = [_placed(job, placed, side, spent) for job, placed in zip(jobs, places, strict=True)]
     else:
-        bakes = [job.bake() if job.texture is None else _textured(job, sizes) for job in jobs]
+        bakes = [_textured(job, sizes) if job.texture else job.bake() if job.finer is None else _automatic(job, sizes)
+                 for job in jobs]
     for number, bake in enumerate(bakes):
         share = (1 - done) / len(jobs)
         try:
@@ -114,6 +116,18 @@ def _textured(job: Job, sizes: dict) -> Generator[float, None, Transfer | Textur
     (placed,), side = yield from scaled(place([job.texture.part], **sizes), 0, _PLACING)
     spent = time.perf_counter() - began
     return (yield from scaled(_placed(job, placed, side, spent), _PLACING, 1 - _PLACING))
+
+
+def _automatic(job: Job, sizes: dict) -> Generator[float, None, Transfer | TextureTransfer]:
+    """The bake of an object to vertices; and to a texture, where they miss what is inside faces."""
+    assert job.finer is not None
+    found = yield from scaled(job.bake(), 0, _LOOKING)
+    wrong, tolerance = found.record.between_error, found.record.tolerance
+    if wrong is None or tolerance is None or not missed(wrong, tolerance):
+        return found
+    finer = yield from scaled(_textured(job.finer, sizes), _LOOKING, 1 - _LOOKING)
+    record = finer.record.also(said(wrong, tolerance, finer.record.side))
+    return replace(finer, record=replace(record, seconds=record.seconds + found.record.seconds))
 
 
 def _placed(job: Job, placed: Placed, side: int, spent: float
@@ -143,7 +157,7 @@ def finish_batch(context: bpy.types.Context, batch: Batch, results: Sequence[Res
                                 "again.")
             if batch.shared:
                 owners.append(check(context, job).data)
-            baked.append((job, result))
+            baked.append((job.finer if job.finer and isinstance(result, TextureTransfer) else job, result))
         except UserError as error:
             outcomes.append(Outcome(job.name, None, _named(job, error, len(batch.jobs) + len(batch.refused))))
     images: list[bpy.types.Image] = []

@@ -19,13 +19,14 @@ from ..backend.errors import UserError
 from ..backend.exchange import check_folder
 from ..backend.geometry import Surface
 from ..backend.lamps import Lamps
+from ..backend.raycast import Geometry
 from ..backend.record import VERSION, BakeRecord
 from ..backend.resolution import fitting_side
 from ..backend.texels import NormalMap
 from ..backend.texture import TextureTransfer, remove_tiles
 from ..backend.texture import bake as bake_texture
 from ..backend.transfer import Transfer
-from ..properties import COLLECTION, DENSITY, FIT, TEXTURE, NeuralGashSettings
+from ..properties import AUTOMATIC, COLLECTION, DENSITY, FIT, RAYS, TEXTURE, NeuralGashSettings
 from ..scene.attributes import read_record, write_textures, write_transfer
 from ..scene.lighting import apply_light, take_light
 from ..scene.normal_maps import read_normal_maps
@@ -74,11 +75,15 @@ class Job:
     texture: TextureOptions | None  # None: to vertices
     bounces: bool          # light was to bounce, so the albedo counts
     lamps: Lamps | None    # what lights it besides, if that was wanted
+    finer: Job | None = None  # to a texture, if vertices miss what is inside faces: see `prepare`
 
 
 def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: NeuralGashSettings,
             tiles: Path | None = None, group: Sequence[bpy.types.Object] = (), lamps: LampReader | None = None) -> Job:
     """Read the object and what blocks its light.
+
+    Where the target is automatic and a plan is to keep to a tolerance, the job is to vertices, and has one to a texture
+    beside it, for what they may miss; unless the mesh can have no texture.
 
     Args:
         tiles: a folder for the finished tiles of a texture, from which a bake that was killed goes on.
@@ -88,21 +93,37 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
     """
     if obj is None:
         raise UserError(refusal(None))
+    read = read_object(obj, context.evaluated_depsgraph_get())
+    mode = occluder_mode(obj, settings, group) if methods.METHODS[settings.method].sees else SELF
+    occluders = read_occluders(obj, mode, context.evaluated_depsgraph_get())
+    prepared = partial(_prepared, context, obj, settings, read, mode, occluders,
+                       lit=lamps.of(obj) if lamps is not None else None)
+    if settings.target == TEXTURE:
+        return prepared(to_texture=True, tiles=tiles)
+    job = prepared(to_texture=False)
+    if settings.target == AUTOMATIC and methods.METHODS[settings.method].plans and settings.quality != RAYS:
+        try:
+            return replace(job, finer=prepared(to_texture=True, tiles=tiles))
+        except UserError:  # no room for a UV map, for instance: then vertices it is
+            return job
+    return job
+
+
+def _prepared(context: bpy.types.Context, obj: bpy.types.Object, settings: NeuralGashSettings, read: SceneMesh,
+              mode: str, occluders: Sequence[Geometry], *, to_texture: bool, tiles: Path | None = None,
+              lit: Lamps | None) -> Job:
+    """The job of one target. Raises UserError: that cannot be baked."""
     depsgraph = context.evaluated_depsgraph_get()
-    read = read_object(obj, depsgraph)
     method = methods.METHODS[settings.method]
-    mode = occluder_mode(obj, settings, group) if method.sees else SELF
     quality = settings.tracing()
     reflection = None
-    if method.traces and settings.bounces:
-        if settings.target != TEXTURE:
+    if method.bounces and settings.bounces:
+        if not to_texture:
             check_attributes(settings.order)
         reflection = read_reflection(obj, mode, depsgraph, settings.bounces)
-    occluders = read_occluders(obj, mode, depsgraph)
-    lit = lamps.of(obj) if lamps is not None else None
     bake: Callable[..., Generator[float, None, Transfer | TextureTransfer]]
     texture = None
-    if settings.target == TEXTURE:
+    if to_texture:
         maps = read_normal_maps(obj, depsgraph, read.surface, read.matrix)
         what = {"method": settings.method, "order": settings.order, "occluders": occluders, "normal_maps": maps}
         texture = _texture_options(obj, settings, read.surface, tiles, what)
@@ -145,7 +166,7 @@ def _texture_options(obj: bpy.types.Object, settings: NeuralGashSettings, surfac
         check_folder(folder)
     if uv is None:
         check_room(obj.data)
-    trial = partial(fitting_side, surface, error=settings.tolerance, **what) if settings.sizing == FIT else None
+    trial = partial(fitting_side, surface, error=settings.tolerance, **what) if _fits(settings) else None
     part = Part(surface, uv, trial, obj.name)
     check_part(part)  # here, as a texture that is shared is placed for all objects at once
     check_area(part)
@@ -155,8 +176,14 @@ def _texture_options(obj: bpy.types.Object, settings: NeuralGashSettings, surfac
 def size(settings: NeuralGashSettings) -> dict:
     """The arguments of `atlas.place` that say how large a texture is."""
     dense = settings.sizing == DENSITY and not settings.uv_map  # a UV map that is there has no metres
-    return {"side": None if dense or settings.sizing == FIT else settings.side,
+    dense = dense and not _fits(settings)
+    return {"side": None if dense or _fits(settings) else settings.side,
             "texels_per_metre": settings.texels_per_metre if dense else None, "padding": settings.padding}
+
+
+def _fits(settings: NeuralGashSettings) -> bool:
+    """Whether a texture is as large as the tolerance asks for."""
+    return settings.sizing == FIT or settings.target == AUTOMATIC
 
 
 def _key(settings: NeuralGashSettings, shape: str, matrix: NDArray, maps: Sequence[NormalMap], lamps: Lamps | None

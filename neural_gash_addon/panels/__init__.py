@@ -192,7 +192,7 @@ class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):
             layout.prop(settings, "occluders")
             if settings.occluders == COLLECTION:
                 layout.prop(settings, "collection")
-        if METHODS[settings.method].traces:
+        if METHODS[settings.method].bounces:
             layout.prop(settings, "bounces")
         layout.prop(settings, "lamps")
         if settings.lamps:

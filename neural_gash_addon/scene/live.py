@@ -209,7 +209,7 @@ def _as_bake(scene: bpy.types.Scene, obj: bpy.types.Object, depsgraph: bpy.types
     settings = scene.neural_gash
     bounces = settings.bounces or before.bounces
     reflection = None
-    if bounces and methods.METHODS[settings.method].traces:
+    if bounces and methods.METHODS[settings.method].bounces:
         check_attributes(before.order)
         reflection = read_reflection(obj, before.occluders, depsgraph, bounces)
     return methods.run(methods.bake(mesh, settings.method, before.order, reflection=reflection, whole=True,

@@ -2,12 +2,10 @@
 """What `auto` says of domain and target: shadows inside faces that corners miss, and the texture that has them."""
 import re
 
-import numpy as np
 import pytest
 
-from neural_gash_addon.backend import advice, methods, resolution
-from neural_gash_addon.backend.geometry import Surface, TriangleMesh
-from neural_gash_addon.backend.raycast import Occluders
+from neural_gash_addon.backend import methods
+from neural_gash_addon.backend.geometry import TriangleMesh
 
 from .shapes import cube, grid, sphere, torus
 
@@ -25,43 +23,12 @@ def sentences(record):
 def test_a_shadow_inside_a_face_that_its_corners_miss_is_said():
     coarse, fine = (TriangleMesh.from_triangles(*grid(n)) for n in (2, 60))
     method, order, _, target = sentences(bake(coarse, tolerance=0.1, occluders=[TABLE]).record)
-    assert target.startswith("Shadow edges inside faces are missed by their corners (") and "a texture of" in target
+    assert target.startswith("Shadow edges inside faces are missed by their corners (")
+    assert target.endswith("a texture would have them.")
     assert method.startswith("Shadows are")  # at the corners there is next to none, so nothing is traced
     assert order == "Band 2 is 34 % of the whole: order 3 is kept."
     target = sentences(bake(fine, tolerance=0.1, occluders=[TABLE]).record)[3]
     assert target.startswith("Shadows inside faces follow their corners") and target.endswith("vertices are enough.")
-
-
-@pytest.mark.parametrize("tolerance", [0.1, 0.03])
-def test_the_texture_that_is_advised_is_about_as_large_as_one_fitted_to_the_error(tolerance):
-    positions, triangles = grid(2)
-    mesh = TriangleMesh.from_triangles(positions, triangles)
-    surface = Surface(positions, triangles.ravel().astype(np.int32), np.tile([0, 0, 1], (6, 1)).astype(np.float32),
-                      np.repeat([0, 1], 3).astype(np.int32), np.arange(6, dtype=np.int32).reshape(2, 3), 0.0)
-    fitted = methods.run(resolution.fitting_side(surface, positions[triangles.ravel(), :2], error=tolerance, order=3,
-                                                 occluders=[TABLE]))
-    for seed in range(3):
-        target = sentences(bake(mesh, tolerance=tolerance, occluders=[TABLE], seed=seed).record)[3]
-        side = int(re.search(r"about (\d+)", target)[1]) * advice._FULL ** 0.5  # the floor fills its texture
-        assert fitted / 4 < side < 4 * fitted
-
-
-def test_lookups_around_a_point_are_bilinear():
-    """On a flat floor, what is linear comes back exactly; beyond its border there is nothing to read."""
-    positions, triangles = grid(7)
-    mesh = TriangleMesh.from_triangles(positions, triangles)
-    rng = np.random.default_rng(2)
-    faces = rng.integers(0, len(triangles), 200)
-    weights = rng.dirichlet([1, 1, 1], 200)
-    met, at, shares = advice.around(mesh, Occluders([(positions, triangles)]), faces, weights, 0.02, rng)
-    places = np.einsum("nc,ncx->nx", weights, positions[triangles[faces]])
-    read = np.einsum("rc,rcx->rx", at, positions[triangles[met]]).reshape(200, 4, 3)
-    inside = (np.abs(places[:, :2] - 0.5) < 0.47).all(1)
-    assert inside.sum() > 100
-    np.testing.assert_allclose(np.einsum("nc,ncx->nx", shares, read)[inside], places[inside], atol=1e-5)
-    np.testing.assert_allclose(shares.sum(1), 1, atol=1e-6)
-    far = np.abs(read - places[:, None]).max(2)
-    assert (far[inside] <= 0.02 * 2 ** 0.5 + 1e-5).all() and far[inside].max() > 0.015
 
 
 @pytest.mark.parametrize(("smooth", "words"), [(True, "each vertex has one value"), (False, "each side of an edge")])

@@ -92,7 +92,7 @@ def test_what_is_left_is_met_by_tracing(ring, monkeypatch, method):
         chosen = bands.chosen(3, order, tolerance, [found.beyond(n) for n in range(order)])
         return auto_bake.Plan(method, tolerance=chosen.left, reason="So."), chosen
 
-    monkeypatch.setattr(auto_bake, "choose_bands", forced)
+    monkeypatch.setattr(auto_bake, "traced_bands", forced)
     found = bake(mesh, 5, 0.25)
     here = whole(found, 5)
     error = (((here - one) * (here - two)).sum() / (one * two).sum()) ** 0.5
@@ -202,7 +202,7 @@ def test_fewer_bands_are_taken_where_they_take_no_more_time_and_the_tolerance_ha
     for points in (1000, 200_000):
         for tolerance in (0.5, 0.25, 0.2, 0.18, 0.15, 0.05):
             chosen, kept = plan.traced_bands(found, points, 5, tolerance)
-            every = plan.choose(found, points, tolerance)
+            every = plan.cheapest(found, points, tolerance)
             assert plan.seconds(chosen, found.to_order(kept.order), points) <= plan.seconds(every, found, points)
             assert kept.dropped ** 2 + (1 - kept.dropped ** 2) * kept.left ** 2 <= tolerance ** 2 * (1 + 1e-9)
             assert kept.dropped <= plan.bands.MOST_DROPPED * tolerance

@@ -391,7 +391,7 @@ def test_weights_that_were_saved_are_those_that_are_asked(room, tmp_path, monkey
         run(embedding_bake.irradiance(box_room(), *QUERIES))
     made = network(networks.SMALL)
     weights.save(tmp_path / weights.EMBEDDING, {name: value.numpy() for name, value in made.state_dict().items()})
-    np.testing.assert_array_equal(reflected(embedding_bake.network().cpu(), *room), reflected(made, *room))
+    np.testing.assert_array_equal(reflected(embedding_bake.network(), *room), reflected(made, *room))
 
 
 def test_without_torch_one_sentence_says_how_to_get_it(monkeypatch):

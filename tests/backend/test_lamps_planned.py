@@ -41,7 +41,8 @@ def encodings(monkeypatch):
     """Rooms cost nothing, as if there were many points; how many were encoded."""
     calls, real = [], embedding_bake.encoded
     monkeypatch.setattr(embedding_bake, "encoded", lambda *a, **k: calls.append(1) or real(*a, **k))
-    monkeypatch.setattr(lamps, "_ROOM", 0)
+    monkeypatch.setattr(lamps, "_MEASURED", 0)
+    monkeypatch.setattr(lamps, "_SCENE_POINT", 0)
     monkeypatch.setattr(lamps, "_TRIAL", 256)
     return calls
 

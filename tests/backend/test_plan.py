@@ -96,15 +96,15 @@ def test_looser_tolerances_never_cost_more_and_the_cheapest_is_taken():
         before = 0.0
         for tolerance in (0.2, 0.1, 0.05, 0.02, 0.01):
             every = [plan.seconds(p, found, points) for p in plan.plans(found, points, tolerance)]
-            chosen = plan.seconds(plan.choose(found, points, tolerance), found, points)
+            chosen = plan.seconds(plan.cheapest(found, points, tolerance), found, points)
             assert chosen == min(every) and chosen >= before
             before = chosen
 
 
 def test_shadows_below_the_tolerance_are_not_traced():
     found = seen(0.01, 0.001)
-    assert plan.choose(found, 1000, 0.02).method == "analytic"
-    assert plan.choose(found, 1000, 0.005).method != "analytic"
+    assert plan.unshadowed(found, 0.02).method == "analytic"
+    assert plan.unshadowed(found, 0.005) is None
 
 
 def test_a_number_of_rays_is_traced_as_asked_for():

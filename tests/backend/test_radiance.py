@@ -228,6 +228,23 @@ def test_a_bake_by_direction_is_like_tracing(shipped):
         found.values, run(embedding_bake.irradiance(scene, points, normals, threads=1)).values)
 
 
+def test_without_room_on_the_gpu_the_processor_does_the_work(shipped, monkeypatch, caplog):
+    tried = []
+
+    class Room(embedding_bake.Room):
+        def __init__(self, model, points, radiance=None, device="cpu"):
+            tried.append(device)
+            if device == "cuda":
+                raise torch.cuda.OutOfMemoryError("no room")
+            super().__init__(model, points, radiance, device)
+
+    monkeypatch.setattr(embedding_bake, "Room", Room)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: None)
+    found = run(embedding_bake.irradiance(base.box_room(), *base.QUERIES, threads=1, order=3))
+    assert tried == ["cuda", "cpu"] and "too little memory" in caplog.text and found.values.all()
+
+
 def test_bad_input_by_direction(shipped):
     scene = base.box_room()
     dark = LitScene(scene.positions, scene.triangles, scene.albedo, np.zeros((14, 3)))
@@ -240,6 +257,9 @@ def test_bad_input_by_direction(shipped):
                                       *base.QUERIES, order=3))
     with pytest.raises(ValueError, match="order 6"):
         run(embedding_bake.irradiance(scene, *base.QUERIES, order=6))
+    room = run(embedding_bake.encoded(scene, threads=1))
+    with pytest.raises(ValueError, match="without directions"):
+        run(embedding_bake.irradiance(scene, *base.QUERIES, threads=1, room=room, order=3))
     empty = run(embedding_bake.irradiance(scene, np.zeros((0, 3)), np.zeros((0, 3)), threads=1, order=5))
     assert empty.shape.shape == (0, 25, 3)
 

@@ -170,3 +170,35 @@ def test_texels_take_the_colour_of_the_part_of_anothers_image_that_is_beside_the
     assert red[3:10].mean() > 1.05 * green[3:10].mean() and green[22:29].mean() > 1.05 * red[22:29].mean()
     found, (picture,) = read_finish(wall, "SELF", bpy.context.evaluated_depsgraph_get())
     assert found[:, 0].max() < 0.8 and picture.lookups()[..., 0].max() > 0.85   # a mean, and what it is of
+
+
+def test_the_embedding_has_them_at_vertices(room, settings):
+    pytest.importorskip("torch")
+    floor, _ = room
+    settings.method = "embedding"
+    _bake()
+    transfer, record = _read(floor)
+    assert record.method == "embedding" and record.colours == 3 and 1 <= record.bounces <= 8
+    near = transfer[::GRID + 1][1:-1, 0].mean(0)
+    assert near[0] > 1.05 * near[1] and near[1] == pytest.approx(near[2], rel=0.02)
+    settings.method = "embree"
+    _bake()
+    reddened, truth = (each[:, 0, 0].mean() / each[:, 0, 1].mean() for each in (transfer, _read(floor)[0]))
+    assert truth > 1.1 and reddened == pytest.approx(truth, rel=0.02)
+
+
+def test_the_embedding_has_them_in_textures(room, settings):
+    pytest.importorskip("torch")
+    floor, _ = room
+    settings.method, settings.target, settings.side = "embedding", "TEXTURE", 32
+    _bake()
+    values = np.empty((32, 32, 4), np.float32)
+    floor.data["neural_gash_images"]["0"].pixels.foreach_get(values.ravel())
+    assert values[..., 0].mean() > 1.01 * values[..., 1].mean()
+
+
+@pytest.mark.parametrize("method, shown", [("embree", True), ("embedding", True), ("gnn", False), ("analytic", False)])
+def test_the_panel_offers_them_where_the_method_follows_them(room, settings, method, shown):
+    from .test_ops_registration import _draw
+    settings.method = method
+    assert ("bounces" in _draw("settings")) == shown

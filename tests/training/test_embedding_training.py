@@ -62,6 +62,52 @@ def test_rooms_are_of_their_split(cache):
     assert [len(embedding.rooms(cache, split)) for split in ("train", "validation")] == [3, 1]
 
 
+def test_a_share_of_the_scene_points_are_the_first_of_them(cache):
+    path, = embedding.rooms(cache, "validation")
+    whole, part = (embedding.load(path, TINY, share) for share in (1.0, 0.5))
+    assert len(whole.points) == 400 and len(part.points) == len(part.direct) == part.looks.shape[1] == 200
+    np.testing.assert_array_equal(part.points, whole.points[:200])
+    np.testing.assert_array_equal(part.looks, whole.looks[:, :200])
+    assert len(part.layout.around) == 50 and part.near.max() < 50 and part.layout.gathered.max() < 200
+    assert part.layout.areas.sum() == pytest.approx(whole.layout.areas.sum(), rel=0.2)
+    np.testing.assert_array_equal(part.truth, whole.truth)
+
+
+def test_equation_12_is_that_of_the_paper_and_what_it_is_relative_to_is_fixed():
+    found, truth = torch.tensor([[0.0, 1, 3]], requires_grad=True), torch.tensor([[1.0, 1, 1]])
+    e = embedding.EPSILON
+    loss = embedding.of_logarithms(found, truth, truth)
+    squares = (np.log(2) / e) ** 2, 0, (np.log(2) / (np.log(4) + e)) ** 2
+    assert float(loss.detach()) == pytest.approx(np.mean(squares), rel=1e-5)
+    loss.backward()
+    by_hand = [-2 * np.log(2) / e ** 2 / 3, 0, 2 * np.log(2) / (np.log(4) + e) ** 2 / 4 / 3]
+    np.testing.assert_allclose(found.grad[0], by_hand, rtol=1e-5, atol=1e-7)
+    dark = torch.zeros(1, 3, requires_grad=True)
+    embedding.of_logarithms(dark, torch.zeros(1, 3), truth).backward()
+    assert not dark.grad.any()
+
+
+@pytest.mark.parametrize("configuration, loss", [("full", "logarithms"), ("small", "values")])
+def test_each_configuration_takes_a_step_from_the_command_line(cache, tmp_path, monkeypatch, capsys, configuration,
+                                                               loss):
+    """The full one as large as it is, in tiny rooms and at few queries; where there is CUDA, there."""
+    recipe = embedding.RECIPES[configuration]
+    assert recipe.rooms * recipe.queries == 8192
+    monkeypatch.setitem(embedding.RECIPES, configuration, replace(recipe, rooms=1, queries=40))
+    monkeypatch.setattr(embedding, "HELD_OUT", 40)
+    monkeypatch.setattr("sys.argv", ["embedding", "--configuration", configuration, "--steps", "1", "--loss", loss,
+                                     "--cache", str(cache), "--out", str(tmp_path), "--logs", str(tmp_path)])
+    embedding.main()
+    assert "3 rooms, 1 held out" in capsys.readouterr().out
+    log, = tmp_path.glob("*.csv")
+    assert log.stem == {"full": "embedding-full", "small": "embedding-values"}[configuration]
+    assert len(losses_of(log)) == 1 and np.isfinite(losses_of(log)).all()
+    with monkeypatch.context() as patch:
+        patch.setattr(embedding_bake.weights, "FOLDER", tmp_path)
+        model = embedding_bake.network()
+    assert model.settings == recipe.settings and len(model.encoder.blocks) == recipe.settings.blocks
+
+
 def losses_of(log):
     with log.open(newline="") as file:
         return [float(row["loss"]) for row in csv.DictReader(file)]
@@ -90,6 +136,19 @@ def test_it_learns_and_goes_on_from_its_checkpoint(cache, tmp_path, monkeypatch)
         np.testing.assert_allclose(two.detach(), one.detach(), atol=1e-6)
 
 
+def test_a_training_that_goes_on_begins_with_the_weights_that_ship(cache, tmp_path, monkeypatch):
+    torch.manual_seed(7)
+    shipped = Embedding(TINY)
+    monkeypatch.setattr(embedding_bake, "network", lambda: shipped)
+    kept, held = embedding.rooms(cache, "train"), [held_out(cache)]
+    for goes_on in (True, False):
+        recipe = replace(RECIPE, steps=1, every=1, rate=1e-6, goes_on=goes_on)
+        made = embedding.train(recipe, kept, held, 3, tmp_path / f"{goes_on}", tmp_path / "log.csv")
+        torch.manual_seed(7)
+        assert goes_on == all(torch.allclose(one, two, atol=1e-4) for one, two in zip(
+            made.parameters(), Embedding(TINY).parameters(), strict=True))
+
+
 def test_training_asks_as_the_bake_does(cache):
     """The same room through both: what is learned is what is used."""
     torch.manual_seed(0)
@@ -113,7 +172,7 @@ def test_errors_are_over_those_of_darkness_and_without_noise(cache):
     assert found["squares"] == pytest.approx(0.25, rel=1e-5)
     one, other = np.log1p(1.5 * truth / sample.level), np.log1p(truth / sample.level)
     assert found["logs"] == pytest.approx(np.square(one - other).sum() / np.square(other).sum(), rel=1e-4)
-    loss = embedding.relative(*(torch.from_numpy(each / sample.level) for each in (
+    loss = embedding.of_values(*(torch.from_numpy(each / sample.level) for each in (
         1.5 * truth, truth, sample.guide[rows])))
     assert found["relative"] == pytest.approx(float(loss), rel=1e-4)
     noise = np.full_like(sample.noise, 0.1)
@@ -142,7 +201,7 @@ def test_the_table_has_a_row_of_the_network_and_of_each_baseline(cache):
 
 def test_the_weights_that_ship_are_better_than_what_needs_no_training(tmp_path):
     """In a room of a seed that no split has."""
-    model = embedding_bake.network().cpu()
+    model = embedding_bake.network()
     room = room_labels.label(rooms.generate(3_000_003), seed=3_000_003, split="evaluation", rays=1024, queries=1024)
     write_npz(tmp_path / "room.npz", **room)
     sample = embedding.load.__wrapped__(tmp_path / "room.npz", model.settings)

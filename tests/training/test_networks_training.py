@@ -133,16 +133,43 @@ def test_balanced_accuracy_does_not_reward_the_larger_class():
 @pytest.mark.parametrize("encoding", list(paper.ENCODINGS))
 def test_encodings_have_the_width_that_they_say(cache, encoding):
     known = paper.Source(sorted(cache.glob("*.npz"))[0])
-    example = known.example(encoding, np.random.default_rng(0))
+    example = known.example(encoding, np.random.default_rng(0), local=False)
     assert example.encoded.shape == (len(example.blocked), paper.ENCODINGS[encoding][0])
 
 
-def test_turned_patches_see_what_the_turned_mesh_shows(cache):
+def test_turned_meshes_see_what_the_turned_mesh_shows(cache):
     """Visibility traced anew after a turn is that of the same mesh labelled turned."""
     known = paper.Source(sorted(cache.glob("*.npz"))[1])
-    plain, turned = known.example("plain", None), known.example("plain", np.random.default_rng(4))
+    plain, turned = known.look("plain", None), known.look("plain", np.random.default_rng(4))
+    np.testing.assert_array_equal(plain.sight.asked, turned.sight.asked)
     # the share that is blocked does not turn; the directions differ, so single rays do
     assert float(turned.visibility.mean()) == pytest.approx(float(plain.visibility.mean()), abs=0.02)
-    normals = turned.encoded[:, 3:].double().numpy()
+    assert (turned.visibility != plain.visibility).any()
+    normals = turned.sight.encoded[:, 3:].double().numpy()
     up = conformal.frames(conformal.motor(np.zeros_like(normals), normals))[:, :, 1]
     np.testing.assert_allclose(up, normals, atol=1e-6)
+
+
+def test_stage_1_of_a_patch_is_that_of_the_whole(cache):
+    """What a vertex hears does not depend on which others are asked."""
+    torch.manual_seed(0)
+    known, network = paper.Source(sorted(cache.glob("*.npz"))[0]), networks.VisibilityNet().eval()
+    rows = np.arange(20, 60)
+    with torch.no_grad():
+        whole, part = (network.ask(paper.Sight(*paper.tensors(*known.places.sight(asked))))
+                       for asked in (np.arange(len(known.lit)), rows))
+    np.testing.assert_allclose(part, whole[rows], atol=1e-5)
+
+
+@pytest.mark.parametrize("local", [False, True])
+def test_turned_patches_have_the_labels_of_their_axes(cache, local):
+    """Turned back, the blocked part is the mesh's own."""
+    known = paper.Source(sorted(cache.glob("*.npz"))[1])
+    found = known.example("plain", np.random.default_rng(4), local)
+    assert len(found.blocked) == len(known.blocked)
+    normals = found.encoded[:, 3:].double().numpy()
+    # the rotation of the patch, from its normals alone (Kabsch)
+    left, _, right = np.linalg.svd(known.sample.normals.T.astype(float) @ normals)
+    back = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    turn = back @ labels.motor_frames(normals) if local else np.broadcast_to(back, (len(normals), 3, 3))
+    np.testing.assert_allclose(sh.rotate_each(found.blocked.numpy(), turn), known.blocked, atol=1e-5)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-EDGES_AT_ONCE = 1 << 17
+EDGES_AT_ONCE = 1 << 14  # what is made of them stays in the cache
 
 
 def _parts(start: Tensor) -> Iterator[tuple[int, int]]:
@@ -51,18 +51,22 @@ def _attended(scores: Tensor, values: Tensor, target: Tensor, count: int) -> Ten
 
 
 class TransformerConv(nn.Module):
-    """Dot-product attention (Shi et al. 2021, "Masked Label Prediction"), heads side by side, with a root weight."""
+    """Dot-product attention (Shi et al. 2021, "Masked Label Prediction"), heads side by side, with a root weight.
 
-    def __init__(self, inputs: int, channels: int, heads: int) -> None:
+    What edges say of themselves, where they do, is added to keys and values.
+    """
+
+    def __init__(self, inputs: int, channels: int, heads: int, edge_dim: int = 0) -> None:
         super().__init__()
         self.heads, self.channels = heads, channels
         self.lin_key = nn.Linear(inputs, heads * channels)
         self.lin_query = nn.Linear(inputs, heads * channels)
         self.lin_value = nn.Linear(inputs, heads * channels)
         self.lin_skip = nn.Linear(inputs, heads * channels)
+        self.lin_edge = nn.Linear(edge_dim, heads * channels, bias=False) if edge_dim else None
 
-    def forward(self, x: Tensor, source: Tensor, start: Tensor) -> Tensor:
-        """(N, inputs) to (N, heads * channels)."""
+    def forward(self, x: Tensor, source: Tensor, start: Tensor, edge: Tensor | None = None) -> Tensor:
+        """(N, inputs) and (E, edge_dim) to (N, heads * channels)."""
         shape = (-1, self.heads, self.channels)
         key, value = self.lin_key(x).view(shape), self.lin_value(x).view(shape)
         query = self.lin_query(x).view(shape) / math.sqrt(self.channels)
@@ -70,8 +74,12 @@ class TransformerConv(nn.Module):
         for first, last in _parts(start):
             target = _target(start, first, last)
             origin = source[start[first]:start[last]]
-            scores = (query[first:last][target] * key[origin]).sum(-1)
-            out.append(_attended(scores, value[origin], target, last - first).flatten(1))
+            keys, values = key[origin], value[origin]
+            if self.lin_edge is not None and edge is not None:
+                along = self.lin_edge(edge[start[first]:start[last]]).view(shape)
+                keys, values = keys + along, values + along
+            scores = (query[first:last][target] * keys).sum(-1)
+            out.append(_attended(scores, values, target, last - first).flatten(1))
         return torch.cat(out) + self.lin_skip(x)
 
 

@@ -32,7 +32,7 @@ SEEN = 4   # numbers of a scene point that do not turn: its size, the whole, how
 class Codes:
     """What queries read, anchored at the M scene points."""
 
-    values: Tensor  # (M, K)
+    values: Tensor  # (M, K), or (M, K, C) of channels
     key: Tensor     # (M, H)
     value: Tensor   # (M, H)
 
@@ -42,7 +42,7 @@ def bands(terms: int) -> Tensor:
     return torch.arange(terms).float().add(1e-3).sqrt().long()
 
 
-def _by_band(weights: Tensor, terms: int) -> Tensor:
+def by_band(weights: Tensor, terms: int) -> Tensor:
     """Weights (..., MAX_ORDER) of bands to those of K coefficients."""
     return weights[..., bands(terms).to(weights.device)]
 
@@ -90,7 +90,7 @@ class Encoder(nn.Module):
         for number, block in enumerate(self.blocks):
             x = block(x, lie, frame.around, frame.orders[curves[number % CURVES]])
         x = self.leave(x)[0]
-        mix = _by_band(self.share(x).view(len(x), 1 + POOLS, MAX_ORDER).softmax(1), values.shape[1])
+        mix = by_band(self.share(x).view(len(x), 1 + POOLS, MAX_ORDER).softmax(1), values.shape[1])
         mixed = mix[parents, 0] * values + (mix[:, 1:] * pooled).sum(1)[parents]
         key, value = (self.key_value(x)[parents] + self.own(seen)).chunk(2, 1)
         return Codes(mixed, key, value)
@@ -115,16 +115,20 @@ class Decoder(nn.Module):
         Args:
             places, normals: (n, 3) of queries. near: (n, k) the scene points nearest to each.
         """
+        own, factors = self.own(codes, frame, places, normals, near)
+        values = codes.values[near]
+        found = (by_band(own, values.shape[2]) * values).sum(1)
+        return found * by_band(factors, values.shape[2])
+
+    def own(self, codes: Codes, frame: Frame, places: Tensor, normals: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
+        """Weights (n, k, MAX_ORDER) of each band of the scene points, and factors (n, MAX_ORDER) on their means."""
         spacing = frame.areas.sqrt().clamp_min(float(frame.spacing.min()) / 2)
         lie = relation(places, normals, frame.places[near], frame.normals[near], spacing[near])
         relates, offset = self.lie(lie).chunk(2, 2)
         weights = self.weigh((codes.key[near] + relates).relu())                # (n, k, MAX_ORDER + H)
         own = (weights[..., :MAX_ORDER] + self.kernel(lie)).softmax(1)
-        values = codes.values[near]
-        found = (_by_band(own, values.shape[2]) * values).sum(1)
         latent = (weights[..., MAX_ORDER:].softmax(1) * (codes.value[near] + offset)).sum(1)
-        factors = _factor(self.finish(functional.gelu(self.enter(self.norm(latent))))[..., None])
-        return found * _by_band(factors, values.shape[2])
+        return own, _factor(self.finish(functional.gelu(self.enter(self.norm(latent))))[..., None])
 
 
 class SkyEmbedding(nn.Module):
