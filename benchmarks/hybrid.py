@@ -45,9 +45,10 @@ def curve(mesh: TriangleMesh, reference: np.ndarray, ladder: tuple[int, ...],
         for seed in range(MOST_REPEATS):
             if seed >= REPEATS and sum(t for measured in runs.values() for t, _ in measured) > ENOUGH:
                 break
-            for name, measured in runs.items():
+            for number, (name, measured) in enumerate(runs.items()):
                 kept: list[np.ndarray] = []
-                baking = methods.bake(mesh, name, ORDER, rays=rays, seed=seed)  # begins when it is run
+                baking = methods.bake(mesh, name, ORDER, rays=rays,
+                                      seed=2 * seed + number)  # begins when run; directions of a seed may be kept
                 spent = timed(lambda baking=baking, kept=kept: kept.append(methods.run(baking).coefficients))
                 measured.append((spent, metrics.srr(kept[0], reference, unshadowed)))
         for name, measured in runs.items():

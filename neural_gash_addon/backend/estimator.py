@@ -8,6 +8,7 @@ local frame, where they are one matrix product for many points, and rotated once
 """
 from __future__ import annotations
 
+import copy
 from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
@@ -37,17 +38,19 @@ class BlockedEstimator:
     """Sums of Y_k over blocked rays, in each point's local frame."""
 
     def __init__(self, mesh: TriangleMesh, occluders: Occluders, order: int, seed: int, rays: int, sets: int = SETS,
-                 twins: bool = False) -> None:
+                 twins: bool = False, spare: bool = False) -> None:
         """rays: the most that any point will take. seed: independent seeds give independent estimates.
 
         sets: fewer cost less where points are few, whose errors are then less independent. twins: the second half of
-        the points is the first again, whose errors have to be independent: none has the set of its twin.
+        the points is the first again, whose errors have to be independent: none has the set of its twin. spare: as
+        many sets more are made, for `apart`.
         """
         rng = np.random.default_rng([seed, 0])
         self._occluders = occluders
         self._order = order
-        self._count, self._most, self._scramble = sets, rays, int(rng.integers(2**31))
-        self._made = np.zeros((sets, 0, 3))  # directions so far: most bakes stop long before the most rays
+        self._sets_each, self._count = sets, 2 * sets if spare else sets
+        self._most, self._scramble = rays, int(rng.integers(2**31))
+        self._made = np.zeros((self._count, 0, 3))  # directions so far: most bakes stop long before the most rays
         self._points, self._clearance = mesh.points, mesh.clearance
         self._normals = mesh.normals
         self._angles = rng.uniform(0, 2 * np.pi, len(mesh.points)).astype(np.float32)
@@ -56,7 +59,26 @@ class BlockedEstimator:
             first, second = np.split(self._set_of_point, 2)
             second[:] = (first + rng.integers(1, sets, len(second), dtype=np.uint8)) % sets
         self._excess: dict[tuple[int, int], NDArray] = {}
-        self._evaluated: tuple[tuple[int, int], NDArray] | None = None  # the last of `_harmonics`
+        self._evaluated: tuple[tuple[int, int], NDArray] | None = None  # of which directions, and their harmonics
+
+    def prepare(self, stop: int) -> None:
+        """Make the directions 0..stop now, and what is known of them."""
+        self._harmonics(0, stop)
+
+    def apart(self, points: NDArray, rng: np.random.Generator) -> BlockedEstimator:
+        """Of some of the points (n,), and of the same again (2n), by the spare nets: independent of this one.
+
+        Neither has the set of its twin. `rng` must be independent of the seed. What was prepared is shared.
+        """
+        twice = np.tile(points, 2)
+        out = copy.copy(self)
+        out._points, out._clearance, out._normals = (a[twice] for a in (self._points, self._clearance, self._normals))
+        out._angles = rng.uniform(0, 2 * np.pi, len(twice)).astype(np.float32)
+        first = rng.integers(0, self._sets_each, len(points), dtype=np.uint8)
+        second = (first + rng.integers(1, self._sets_each, len(points), dtype=np.uint8)) % self._sets_each
+        out._set_of_point = np.concatenate([first, second]) + np.uint8(self._sets_each)
+        out._excess = {}
+        return out
 
     def trace(self, pool: ThreadPoolExecutor, threads: int, points: NDArray, start: int, stop: int,
               sums: NDArray[np.float64]) -> Generator[float, None, None]:
@@ -115,11 +137,12 @@ class BlockedEstimator:
     def _harmonics(self, start: int, stop: int) -> NDArray[np.float64]:
         """(sets, stop - start, K) of the directions of each set."""
         known = self._evaluated
-        if known is None or known[0] != (start, stop):
+        if known is None or start < known[0][0] or stop > known[0][1]:
             local = self._sets(stop)[:, start:stop]
             known = (start, stop), sh.evaluate(local.reshape(-1, 3), self._order).reshape(*local.shape[:2], -1)
             self._evaluated = known
-        return known[1]
+        (first, _), harmonics = known
+        return harmonics[:, start - first:stop - first]
 
     def _sets(self, stop: int) -> NDArray[np.float64]:
         """(sets, at least stop, 3) directions. A longer net begins with the shorter ones."""

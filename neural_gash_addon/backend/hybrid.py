@@ -35,6 +35,7 @@ LEAST, MOST = -6.0, 12.0  # of the logarithms that the network gives
 HALF = 64.0               # rays at which s is twice what it is with none
 TINY = 1e-6               # of a variance: below the noise of any number of rays
 _BLOCKS = 64, 128         # at a time, at least and at most: less is all overhead, more overflows the cache
+_BETWEEN = 1024           # gaps filled by one worker at a time
 _TURN = np.array([[0.8, -0.48, 0.36], [0.6, 0.64, -0.48], [0.0, 0.6, 0.8]])  # of the second curve
 
 
@@ -143,7 +144,8 @@ def filtered(places: NDArray, normals: NDArray, orders: Sequence[NDArray], block
     return now[:-1]
 
 
-def between(some: NDArray[np.float32], unshadowed: NDArray[np.float32]) -> NDArray[np.float32]:
+def between(some: NDArray[np.float32], unshadowed: NDArray[np.float32], pool: ThreadPoolExecutor
+            ) -> NDArray[np.float32]:
     """The blocked part of all points (n, K) along a curve, from that of the first, the third and so on.
 
     The others take the mean of the two beside them, as `filtered` passes on what is blocked.
@@ -151,16 +153,23 @@ def between(some: NDArray[np.float32], unshadowed: NDArray[np.float32]) -> NDArr
     Args:
         some: (ceil(n / 2), K). unshadowed: (n, K).
     """
-    even = unshadowed[:, 1:] / np.float32(FULL)
-    values = some.copy()
-    values[:, 1:] -= values[:, :1] * even[::2]
     out = np.empty(unshadowed.shape, np.float32)
-    out[::2] = some
-    gaps = out[1::2]
-    gaps[:] = values[:len(gaps)]
-    gaps[:len(values) - 1] += values[1:]
-    gaps[:len(values) - 1] *= np.float32(0.5)
-    gaps[:, 1:] += gaps[:, :1] * even[1::2]
+
+    def part(start: int) -> None:
+        here = some[start:start + _BETWEEN + 1]  # and the one after
+        even = unshadowed[2 * start:2 * (start + len(here)), 1:] / np.float32(FULL)
+        filled = out[2 * start:2 * (start + _BETWEEN)]
+        filled[::2] = here[:_BETWEEN]
+        gaps = filled[1::2]
+        values = here.copy()
+        values[:, 1:] -= values[:, :1] * even[::2]
+        gaps[:] = values[:len(gaps)]
+        both = gaps[:len(values) - 1]
+        both += values[1:]
+        both *= np.float32(0.5)
+        gaps[:, 1:] += gaps[:, :1] * even[1::2][:len(gaps)]
+
+    list(pool.map(part, range(0, len(some), _BETWEEN)))
     return out
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,8 +37,8 @@ _ROWS = 1 << 14       # whose unshadowed transfer one worker computes at a time
 _SAMPLE = 128         # points at which the error is measured, or a 256th of them if that is more
 _MOST_SAMPLE = 2048
 # Rays of each of two independent traces there, where the bake's are given: as many as those, or twice as many where
-# that is little beside the rays of all points. A larger error needs fewer to be measured.
-_TWICE_FROM, _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS = 8192, 8, 128
+# that is little beside the rays of all points, or those are few. A larger error needs fewer to be measured.
+_TWICE_FROM, _TWICE_TO, _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS = 8192, 8, 4, 128
 
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
@@ -78,8 +77,8 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
             share = left if tolerance is None else left / 2
             traced, taken = yield from scaled(work.trace(used, stop), 1 - left, share)
             used, left, probes = stop, left - share, work.probes if pilot is None else 0
-            blocked = work.blended(traced, taken, *sample.result())
-            error = work.error(blocked, *sample.result())
+            blocked, here = work.blended(traced, taken, *sample.result())
+            error = work.error(here, *sample.result())
             if used == last or (error is not None and tolerance is not None and error <= tolerance):
                 coefficients[lit] = work.unshadowed - blocked
                 break
@@ -123,8 +122,7 @@ class _Work:
     def __init__(self, mesh: TriangleMesh, scene: Occluders, order: int, seed: int, rays: int, lit: NDArray,
                  pool: ThreadPoolExecutor, threads: int, network: Network | None, tolerance: float | None = None
                  ) -> None:
-        self._estimator = BlockedEstimator(mesh, scene, order, seed, max(rays, 2))
-        self._mesh, self._scene, self._order, self._seed = mesh, scene, order, seed
+        self._mesh, self._order, self._seed = mesh, order, seed
         self._pool, self._threads, self._network = pool, threads, network
         count = len(lit)
         self.lit = lit  # (n,) which points they are
@@ -152,10 +150,13 @@ class _Work:
         most = count if network else -(-count // 2)
         times = float(np.clip(2 * count / _TWICE_FROM, 1, 2))
         self._sample_size = min(most, max(_SAMPLE, min(count // 256, _MOST_SAMPLE)))
-        self._sample_rays = int(np.clip(round(times * rays), _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS))
+        least = max(_LEAST_SAMPLE_RAYS, min(2 * rays, _TWICE_TO))
+        self._sample_rays = int(np.clip(round(times * rays), least, _MOST_SAMPLE_RAYS))
         if tolerance is not None:
             self._sample_size, self._sample_rays = sample_size(count), pilot_rays(tolerance)
         self.probes = 2 * self._sample_size * self._sample_rays
+        self._estimator = BlockedEstimator(mesh, scene, order, seed, max(rays, self._sample_rays), spare=True)
+        self._estimator.prepare(self._sample_rays)  # once for both
 
     def trace(self, start: int, stop: int) -> Generator[float, None, tuple[NDArray[np.float32], NDArray[np.float32]]]:
         """The blocked part of all points from directions start..stop in addition to those before.
@@ -173,7 +174,7 @@ class _Work:
         list(self._filled)
         traced = self._estimator.blocked(self._pool, lit, sums, stop)
         if half:
-            traced = between(traced, self.unshadowed)
+            traced = between(traced, self.unshadowed, self._pool)
         if self._network is None:
             return traced, traced
         return traced, filtered(*self._placed.result(), traced, self.unshadowed, stop, self._network, self._pool)
@@ -182,11 +183,8 @@ class _Work:
         """Some of the points (s,), and two independent traces (s, K) of their blocked part; on the calling thread."""
         rng = np.random.default_rng([self._seed, 1])
         points = np.sort(rng.choice(len(self.lit), self._sample_size, replace=False))
-        twice = np.tile(self.lit[points], 2)  # each sees a net of its own
-        few = replace(self._mesh, points=self._mesh.points[twice], normals=self._mesh.normals[twice],
-                      clearance=self._mesh.clearance[twice])
-        rows = np.arange(len(twice))
-        twins = BlockedEstimator(few, self._scene, self._order, int(rng.integers(2**31)), self._sample_rays)
+        twins = self._estimator.apart(self.lit[points], rng)
+        rows = np.arange(2 * len(points))
         sums = twins.summed(rows, 0, self._sample_rays)
         one, two = np.split(twins.turned_here(rows, twins.means(rows, sums, 0, self._sample_rays)), 2)
         return points, one, two
@@ -197,26 +195,40 @@ class _Work:
         return order[np.searchsorted(self.lit, points, sorter=order)], one, two
 
     def blended(self, traced: NDArray, taken: NDArray, points: NDArray, one: NDArray, two: NDArray
-                ) -> NDArray[np.float32]:
-        """traced + share * (taken - traced), (n, K), with the share of each band that is nearest the truth.
+                ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """traced + share * (taken - traced), with the share of each band that is nearest the truth.
 
         The sample says so: its two traces are independent of both, so the sum of (traced + share d - one) (traced +
         share d - two) over it is the squared error and a constant, and is least where its derivative vanishes. So a
         network that errs on a mesh, or where rays are many, is not followed.
+
+        Returns:
+            (n, K) of all points; and (s, K) of the sample, each with the shares that all others say are nearest: what
+            a share was chosen by would seem nearer than it is.
         """
         moved = taken - traced
-        here = moved[points].astype(np.float64)
-        slope, curvature = (here * (one + two - 2 * traced[points])).sum(0), 2 * np.square(here).sum(0)
+        here, was = moved[points], traced[points]
         starts = np.square(np.arange(self._order))
-        slope, curvature = np.add.reduceat(slope, starts), np.add.reduceat(curvature, starts)
-        share = np.clip(np.divide(slope, curvature, out=np.ones_like(slope), where=curvature > 0), 0, 1)
-        moved *= np.repeat(share, 2 * np.arange(self._order) + 1).astype(np.float32)
+        slope = np.add.reduceat(here * (one + two - 2 * was), starts, 1)  # (s, bands)
+        curvature = np.add.reduceat(2 * np.square(here, dtype=np.float64), starts, 1)
+        widths = 2 * np.arange(self._order) + 1
+        all_slope, all_curvature = slope.sum(0), curvature.sum(0)
+        others = np.repeat(_share(all_slope - slope, all_curvature - curvature), widths, 1)
+        moved *= np.repeat(_share(all_slope, all_curvature), widths).astype(np.float32)
         moved += traced
-        return moved
+        return moved, was + others * here
 
     def error(self, blocked: NDArray, points: NDArray, one: NDArray, two: NDArray) -> float | None:
-        """Relative L2 error at the sample. Both traces' noise is independent, so it cancels in the product."""
-        squared = float(((blocked[points] - one) * (blocked[points] - two)).sum())
+        """Relative L2 error at the sample, where `blocked` (s, K) is the answer.
+
+        Both traces' noise is independent, so it cancels in the product.
+        """
+        squared = float(((blocked - one) * (blocked - two)).sum())
         open_sky = self.unshadowed[points]
         energy = float(((open_sky - one) * (open_sky - two)).sum())
         return float(max(squared, 0.0) / energy) ** 0.5 if energy > 0 else None
+
+
+def _share(slope: NDArray, curvature: NDArray) -> NDArray:
+    """Of the network's answer: all of it where that moves nothing."""
+    return np.clip(np.divide(slope, curvature, out=np.ones_like(slope), where=curvature > 1e-12), 0, 1)

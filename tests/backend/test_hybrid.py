@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The hybrid bake: equivariance, its limit, its measured error, neighbours, and its slow twin."""
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,9 @@ import pytest
 from neural_gash_addon.backend import hybrid, hybrid_bake, methods, metrics, texture, weights
 from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.errors import UserError
+from neural_gash_addon.backend.estimator import BlockedEstimator
 from neural_gash_addon.backend.geometry import TriangleMesh
+from neural_gash_addon.backend.raycast import Occluders
 
 from . import shapes
 from .test_texture import lookup, surface
@@ -118,12 +121,13 @@ def test_takes_most_of_the_noise_away(case, rays, factor):
     assert better < factor * plain
 
 
-@pytest.mark.parametrize("count", [6, 7])
+@pytest.mark.parametrize("count", [6, 7, 1, 4096, 4097, 4099])
 def test_points_between_others_see_as_much_and_differ_from_an_even_sky_alike(count):
     rng = np.random.default_rng(count)
     unshadowed = sh.cosine_lobe(_unit(rng.normal(size=(count, 3))), 3)
     some = rng.normal(size=(-(-count // 2), 9)).astype(np.float32)
-    found = hybrid.between(some, unshadowed.astype(np.float32))
+    with ThreadPoolExecutor(2) as pool:
+        found = hybrid.between(some, unshadowed.astype(np.float32), pool)
     for i in range(count):
         beside = [i] if i % 2 == 0 else [j for j in (i - 1, i + 1) if j < count]
         share = np.mean([some[j // 2, 0] for j in beside])
@@ -212,6 +216,42 @@ def test_error_is_measured_and_a_tolerance_is_met(case):
         assert metrics.rel_l2(met.coefficients, truth) < 1.4 * tolerance
     easy, hard = (methods.run(methods.bake(mesh, "hybrid", 3, tolerance=t)).record.rays for t in (0.1, 0.02))
     assert easy < hard
+
+
+def test_the_measured_error_is_not_of_shares_that_were_chosen_to_lessen_it():
+    """What a network of mere noise moves is as often nearer as not; few points seem to say that some of it is."""
+    rng = np.random.default_rng(0)
+    work = SimpleNamespace(_order=3, unshadowed=np.ones((400, 9)))
+    points = np.arange(0, 400, 10)
+    found, chosen, true = [], [], []
+    for _ in range(300):
+        traced, taken = (rng.normal(size=(400, 9)).astype(np.float32) for _ in range(2))  # of the truth, which is 0
+        taken = traced + 0.3 * taken
+        one, two = rng.normal(size=(2, len(points), 9))
+        blocked, here = hybrid_bake._Work.blended(work, traced, taken, points, one, two)
+        found.append(((here - one) * (here - two)).sum(1).mean())
+        chosen.append(((blocked[points] - one) * (blocked[points] - two)).sum(1).mean())
+        true.append(np.square(blocked).sum(1).mean())
+    scatter = np.std(found) / 300 ** 0.5
+    assert abs(np.mean(found) - np.mean(true)) < 3 * scatter
+    assert np.mean(chosen) < np.mean(found)  # the twin that the shares were chosen by
+
+
+def test_the_samples_nets_are_independent_of_the_bakes_and_of_each_other(case):
+    mesh, _, truth = case
+    scene = Occluders([(mesh.positions, mesh.triangles)])
+    every = np.arange(len(mesh.points))
+    alike = []
+    for seed in range(4):
+        estimator = BlockedEstimator(mesh, scene, 3, seed, 8, spare=True)
+        errors = []
+        for one, rows in ((estimator, every), (estimator.apart(every, np.random.default_rng([seed, 1])),
+                                               np.arange(2 * len(every)))):
+            local = one.turned_here(rows, one.means(rows, one.summed(rows, 0, 8), 0, 8))
+            errors += [found - (sh.cosine_lobe(mesh.normals, 3) - truth)
+                       for found in np.split(local, len(rows) // len(every))]
+        alike.append([(errors[i] * errors[j]).sum() / np.square(errors[i]).sum() for i, j in ((0, 1), (0, 2), (1, 2))])
+    assert np.abs(np.mean(alike, axis=0)).max() < 0.05  # two that are one have 1
 
 
 def bent_sheet(points):
