@@ -39,6 +39,9 @@ def check_bake(arguments: argparse.Namespace) -> None:
     if arguments.texture is None and (arguments.uv_map or arguments.textures or arguments.half or arguments.share
                                       or arguments.padding is not None):
         raise UserError("--uv-map, --textures, --padding, --half and --share belong to a bake with --texture.")
+    if arguments.texture is not None and arguments.texture[0] == AUTOMATIC and arguments.textures and not (
+            arguments.out or arguments.png):
+        raise UserError("--textures keeps nothing where --texture auto bakes to vertices; add --out or --png.")
     if arguments.uv_map and arguments.texture[0] == DENSITY:
         raise UserError("With --uv-map a texture has no texels per metre; give --texture a number of texels, or fit.")
     if arguments.gloss and (arguments.texture is None or arguments.bounces):

@@ -186,7 +186,11 @@ def _bake(arguments: argparse.Namespace, item: Item, entry: dict, progress: Call
 
 def _kept(own: argparse.Namespace, known: dict) -> list[Path]:
     """What must be there where nothing is to do."""
-    return _outputs(own) + [own.textures / name for name in known["textures"] if own.textures is not None]
+    if own.textures is None:
+        return _outputs(own)
+    folder = Path(os.path.abspath(own.textures))  # which is not there where `--texture auto` baked to vertices
+    return [path for path in _outputs(own) if path != folder or known["textures"]] + [
+        own.textures / name for name in known["textures"]]
 
 
 def _key(own: argparse.Namespace, job: Job, item: Item) -> dict:

@@ -125,7 +125,8 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
     target: EnumProperty(  # type: ignore[valid-type]
         name="Target", description="Where the bake is kept", default=VERTICES,
         items=[(AUTOMATIC, "Automatic", "Vertices; where the method is Automatic, too, and vertices would miss shadows "
-                "inside faces by more than the tolerance, a texture as large as these need"),
+                "inside faces by more than the tolerance, a texture as large as these need. Sequences, and all while "
+                "Live is on, stay at the vertices"),
                (VERTICES, "Vertices", "Numbers at the vertices: quick, and enough for dense meshes"),
                (TEXTURE, "Texture", "Images with a UV map of their own: fine shadows on large faces, and normal maps")])
     sizing: EnumProperty(  # type: ignore[valid-type]
@@ -223,6 +224,16 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
         if not METHODS[self.method].traces:
             return {}
         return {"rays": self.rays} if self.quality == RAYS else {"tolerance": self.tolerance}
+
+    def target_note(self) -> str:
+        """Why the target Automatic means vertices, whatever the mesh; '' where it does not, or is not chosen."""
+        if self.target != AUTOMATIC:
+            return ""
+        if not METHODS[self.method].plans:
+            return "Vertices, as only the method Automatic chooses a target."
+        if self.quality == RAYS:
+            return "Vertices, as there is no tolerance to choose a target by."
+        return "Vertices, as Live is on, and follows no textures." if self.live else ""
 
     def lobe_shown(self) -> str:
         """The lobe of glossy previews; '' where they are dull."""

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Train the light-transport embedding: label rooms, then `python -m training.embedding`; writes weights and a log.
 
-As Xu et al. 2026: relative L2 of logarithms, points in space and not pictures. Rooms are neither turned nor moved, as
-the network gives the same for those by construction; each colour channel is a room of its own, the scene points' light
-has another noise in each of room_labels.LOOKS looks, and each step has some of the points or all.
+As Xu et al. 2026: points in space and not pictures, relative L2; of values, which is better in all measures than that
+of logarithms (equation 12, `--loss logarithms`), see docs/embedding.md. Rooms are neither turned nor moved, as the
+network gives the same for those by construction; each colour channel is a room of its own, the scene points' light has
+another noise in each of room_labels.LOOKS looks, and each step has some of the points or all.
 """
 from __future__ import annotations
 
@@ -193,7 +194,7 @@ BASELINES: dict[str, Callable[[Sample, NDArray], NDArray]] = {
 
 
 def train(recipe: Recipe, kept: list[Path], held: list[Sample], seed: int, checkpoint: Path, log: Path,
-          loss: Loss = of_logarithms) -> Embedding:
+          loss: Loss = of_values) -> Embedding:
     """Train, and write log and checkpoint as we go; on from the checkpoint, where there is one of just this."""
     torch.manual_seed(seed)
     model = embedding_bake.network() if recipe.goes_on else Embedding(recipe.settings)
@@ -231,7 +232,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--configuration", choices=RECIPES, default="small")
     parser.add_argument("--steps", type=int, help="instead of the configuration's")
-    parser.add_argument("--loss", choices=LOSSES, default="logarithms", help="those of values beside equation 12")
+    parser.add_argument("--loss", choices=LOSSES, default="values", help="of values, or equation 12")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cache", type=Path, default=CACHE, help="of labelled rooms, from training.room_labels")
     parser.add_argument("--out", type=Path, default=weights.FOLDER, help="folder of the weights")
@@ -247,7 +248,7 @@ def main() -> None:
         parser.error(f"there are too few labelled rooms in '{arguments.cache}'; make them with "
                      "`python -m training.room_labels`")
     name = "-".join([NAME, *(each for each in (arguments.configuration, arguments.loss)
-                             if each not in ("small", "logarithms"))])
+                             if each not in ("small", "values"))])
     log = arguments.logs / f"{name}.csv"
     model = train(recipe, kept, held, arguments.seed, arguments.cache / f"{name}.checkpoint", log,
                   LOSSES[arguments.loss])

@@ -18,7 +18,7 @@ from ..backend.progress import scaled
 from ..backend.record import BakeRecord
 from ..backend.texture import TextureTransfer, alike, merged
 from ..backend.transfer import Transfer
-from ..properties import TEXTURE, NeuralGashSettings
+from ..properties import NeuralGashSettings
 from ..scene.images import make_images, remove_unused
 from ..scene.lamps import LitScenes
 from .job import Job, check, finish, prepare, size
@@ -43,7 +43,7 @@ class Batch:
 
     jobs: list[Job]
     refused: list[Outcome]
-    shared: bool  # one texture for all
+    share: bool   # one texture for all that have one
     baking: Generator[float, None, list[Result]]
 
     @property
@@ -81,32 +81,49 @@ def prepare_batch(context: bpy.types.Context, objects: Sequence[bpy.types.Object
         meshes[obj.data.session_uid] = obj.name
     if not jobs:
         raise UserError(refused[0].sentence)
-    shared = settings.target == TEXTURE and settings.share and len(jobs) > 1
-    return Batch(jobs, refused, shared, _bake(jobs, shared, size(settings)))
+    return Batch(jobs, refused, settings.share, _bake(jobs, settings.share, size(settings)))
 
 
-def _bake(jobs: list[Job], shared: bool, sizes: dict) -> Generator[float, None, list[Result]]:
-    """The arrays of all jobs, one after another; never touches bpy."""
-    results: list[Result] = []
+def _bake(jobs: list[Job], share: bool, sizes: dict) -> Generator[float, None, list[Result]]:
+    """The arrays of all jobs, one after another, first to vertices; never touches bpy."""
+    results: dict[int, Result] = {}
+    finer = {number: job for number, job in enumerate(jobs) if job.texture}
     done = 0.0
-    if shared:
-        began = time.perf_counter()
-        placing = place([job.texture.part for job in jobs if job.texture], **sizes)
-        places, side = yield from scaled(placing, 0, _PLACING)
-        done, spent = _PLACING, (time.perf_counter() - began) / len(jobs)
-        bakes = [_placed(job, placed, side, spent) for job, placed in zip(jobs, places, strict=True)]
-    else:
-        bakes = [_textured(job, sizes) if job.texture else job.bake() if job.finer is None else _automatic(job, sizes)
-                 for job in jobs]
-    for number, bake in enumerate(bakes):
-        share = (1 - done) / len(jobs)
+
+    def baked(number: int, bake: Generator[float, None, Transfer | TextureTransfer], part: float
+              ) -> Generator[float, None, None]:
+        nonlocal done
         try:
-            results.append((yield from scaled(bake, done + number * share, share)))
+            results[number] = yield from scaled(bake, done, part)
         except UserError as error:
             if len(jobs) == 1:
                 raise
-            results.append(error)
-    return results
+            results[number] = error
+        done += part
+
+    for number, job in enumerate(jobs):
+        if job.texture is None:
+            yield from baked(number, job.bake(), (_LOOKING if job.finer else 1) / len(jobs))
+            found = results[number]
+            if job.finer and isinstance(found, Transfer) and found.record.between_error is not None and missed(
+                    found.record.between_error, found.record.tolerance or 1):
+                finer[number] = job.finer
+    if share and len(finer) > 1:
+        began, part = time.perf_counter(), _PLACING * (1 - done)
+        placing = place([job.texture.part for job in finer.values() if job.texture], **sizes)
+        places, side = yield from scaled(placing, done, part)
+        done, spent = done + part, (time.perf_counter() - began) / len(finer)
+        bakes = [_placed(job, placed, side, spent) for job, placed in zip(finer.values(), places, strict=True)]
+    else:
+        bakes = [_textured(job, sizes) for job in finer.values()]
+    part = (1 - done) / max(len(finer), 1)
+    for number, bake in zip(finer, bakes, strict=True):
+        coarse = results.get(number)
+        yield from baked(number, bake, part)
+        found = results[number]
+        if isinstance(coarse, Transfer) and isinstance(found, TextureTransfer):
+            results[number] = _instead(coarse.record, found)
+    return [results[number] for number in range(len(jobs))]
 
 
 def _textured(job: Job, sizes: dict) -> Generator[float, None, Transfer | TextureTransfer]:
@@ -118,16 +135,11 @@ def _textured(job: Job, sizes: dict) -> Generator[float, None, Transfer | Textur
     return (yield from scaled(_placed(job, placed, side, spent), _PLACING, 1 - _PLACING))
 
 
-def _automatic(job: Job, sizes: dict) -> Generator[float, None, Transfer | TextureTransfer]:
-    """The bake of an object to vertices; and to a texture, where they miss what is inside faces."""
-    assert job.finer is not None
-    found = yield from scaled(job.bake(), 0, _LOOKING)
-    wrong, tolerance = found.record.between_error, found.record.tolerance
-    if wrong is None or tolerance is None or not missed(wrong, tolerance):
-        return found
-    finer = yield from scaled(_textured(job.finer, sizes), _LOOKING, 1 - _LOOKING)
-    record = finer.record.also(said(wrong, tolerance, finer.record.side))
-    return replace(finer, record=replace(record, seconds=record.seconds + found.record.seconds))
+def _instead(vertices: BakeRecord, found: TextureTransfer) -> TextureTransfer:
+    """A texture whose record says why it was not left at the vertices, and counts their time."""
+    assert vertices.between_error is not None and vertices.tolerance is not None
+    record = found.record.also(said(vertices.between_error, vertices.tolerance, found.record.side))
+    return replace(found, record=replace(record, seconds=record.seconds + vertices.seconds))
 
 
 def _placed(job: Job, placed: Placed, side: int, spent: float
@@ -155,19 +167,21 @@ def finish_batch(context: bpy.types.Context, batch: Batch, results: Sequence[Res
             if job.lamps is not None and lit.of(check(context, job))[1] != job.lamps.key:
                 raise UserError(f"The lamps of '{job.name}', or what they light, were changed during the bake; bake "
                                 "again.")
-            if batch.shared:
+            if batch.share and isinstance(result, TextureTransfer):
                 owners.append(check(context, job).data)
             baked.append((job.finer if job.finer and isinstance(result, TextureTransfer) else job, result))
         except UserError as error:
             outcomes.append(Outcome(job.name, None, _named(job, error, len(batch.jobs) + len(batch.refused))))
     images: list[bpy.types.Image] = []
-    if batch.shared and baked:
+    sharing = [job for job, _ in baked if job.texture] if batch.share else []
+    if len(sharing) > 1:
         whole = alike([t for _, t in baked if isinstance(t, TextureTransfer)])
-        baked = [(job, part) for (job, _), part in zip(baked, whole, strict=True)]
-        options = baked[0][0].texture
+        parts = iter(whole)
+        baked = [(job, next(parts) if job.texture else t) for job, t in baked]
+        options = sharing[0].texture
         assert options is not None
-        records = {job.name: {"frame": job.frame, "uv_map": options.uv_map} for job, _ in baked}
-        images = make_images(baked[0][0].name, merged(whole), options.folder, options.half, json.dumps(records),
+        records = {job.name: {"frame": job.frame, "uv_map": options.uv_map} for job in sharing}
+        images = make_images(sharing[0].name, merged(whole), options.folder, options.half, json.dumps(records),
                              owners=owners)
     for job, transfer in baked:
         try:

@@ -26,7 +26,7 @@ from ..backend.texels import NormalMap
 from ..backend.texture import TextureTransfer, remove_tiles
 from ..backend.texture import bake as bake_texture
 from ..backend.transfer import Transfer
-from ..properties import AUTOMATIC, COLLECTION, DENSITY, FIT, RAYS, TEXTURE, NeuralGashSettings
+from ..properties import AUTOMATIC, COLLECTION, DENSITY, FIT, TEXTURE, NeuralGashSettings
 from ..scene.attributes import read_record, write_textures, write_transfer
 from ..scene.lighting import apply_light, take_light
 from ..scene.normal_maps import read_normal_maps
@@ -75,11 +75,13 @@ class Job:
     texture: TextureOptions | None  # None: to vertices
     bounces: bool          # light was to bounce, so the albedo counts
     lamps: Lamps | None    # what lights it besides, if that was wanted
+    note: str = ""         # why Automatic means vertices, for the record
     finer: Job | None = None  # to a texture, if vertices miss what is inside faces: see `prepare`
 
 
 def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: NeuralGashSettings,
-            tiles: Path | None = None, group: Sequence[bpy.types.Object] = (), lamps: LampReader | None = None) -> Job:
+            tiles: Path | None = None, group: Sequence[bpy.types.Object] = (), lamps: LampReader | None = None,
+            movable: bool = True) -> Job:
     """Read the object and what blocks its light.
 
     Where the target is automatic and a plan is to keep to a tolerance, the job is to vertices, and has one to a texture
@@ -88,6 +90,7 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
     Args:
         tiles: a folder for the finished tiles of a texture, from which a bake that was killed goes on.
         group: the objects that are baked together with it. lamps: of them, if they are to be baked too.
+        movable: whether an automatic target may be a texture.
     Raises:
         UserError: that cannot be baked.
     """
@@ -100,12 +103,13 @@ def prepare(context: bpy.types.Context, obj: bpy.types.Object | None, settings: 
                        lit=lamps.of(obj) if lamps is not None else None)
     if settings.target == TEXTURE:
         return prepared(to_texture=True, tiles=tiles)
-    job = prepared(to_texture=False)
-    if settings.target == AUTOMATIC and methods.METHODS[settings.method].plans and settings.quality != RAYS:
+    job = replace(prepared(to_texture=False), note=settings.target_note())
+    if settings.target == AUTOMATIC and not job.note and movable:
         try:
-            return replace(job, finer=prepared(to_texture=True, tiles=tiles))
+            finer = prepared(to_texture=True, tiles=tiles)
         except UserError:  # no room for a UV map, for instance: then vertices it is
             return job
+        return replace(job, finer=finer, key=json.dumps({**json.loads(job.key), "finer": finer.key}, sort_keys=True))
     return job
 
 
@@ -222,7 +226,8 @@ def recorded(context: bpy.types.Context, job: Job, obj: bpy.types.Object, transf
     if job.bounces and transfer.record.colours == 1:  # nothing bounced: no colour counts
         now = fingerprint(obj, context.evaluated_depsgraph_get(), job.occluders,
                           read_uv(obj.data, uv_map) if uv_map else None)
-    return replace(transfer.record, occluders=job.occluders, fingerprint=now, frame=job.frame, uv_map=uv_map)
+    return replace(transfer.record, occluders=job.occluders, fingerprint=now, frame=job.frame, uv_map=uv_map,
+                   plan=f"{transfer.record.plan} {job.note}".strip())
 
 
 def finish(context: bpy.types.Context, job: Job, transfer: Transfer | TextureTransfer,

@@ -100,7 +100,7 @@ def bake_sequence(context: bpy.types.Context, objects: list[bpy.types.Object]
         """Bake one object in one frame."""
         obj = _object(uid, uids[uid])
         together = [o for o in bpy.data.objects if o.session_uid in group]
-        job = prepare(context, obj, _scene(its).neural_gash, group=together)
+        job = prepare(context, obj, _scene(its).neural_gash, group=together, movable=False)
         found = yield from job.bake(whole=True)  # what other frames will want is not known; one order for all
         assert isinstance(found, Transfer)
         transfer = replace(found, record=recorded(context, job, obj, found))

@@ -14,7 +14,7 @@ from ..backend.record import BakeRecord
 from ..ops import state
 from ..ops.job import percent
 from ..ops.preset import PRESETS, preset_in_force
-from ..properties import COLLECTION, DENSITY, FIT, RAYS, TEXTURE, NeuralGashSettings
+from ..properties import AUTOMATIC, COLLECTION, DENSITY, FIT, RAYS, TEXTURE, VERTICES, NeuralGashSettings
 from ..scene import live, staleness
 from ..scene.attributes import RECORD, SEQUENCE, has_bake
 from ..scene.gloss_bounce import bounces_shown, has_bounces
@@ -200,15 +200,20 @@ class NEURAL_GASH_PT_settings(_Panel, bpy.types.Panel):
         if settings.lamps and not METHODS[settings.method].traces:
             layout.prop(settings, "tolerance")
         layout.prop(settings, "target", expand=True)
-        if settings.target == TEXTURE:
+        if settings.target_note():
+            _paragraph(layout.column(align=True), settings.target_note(), "INFO")
+        elif settings.target != VERTICES:
             self._texture(layout, settings, context.object)
 
     def _texture(self, layout: bpy.types.UILayout, settings: NeuralGashSettings, obj: bpy.types.Object | None) -> None:
         """What a texture has beside."""
         if obj is not None and obj.type == "MESH":
             layout.prop_search(settings, "uv_map", obj.data, "uv_layers")
-        layout.prop(settings, "sizing", expand=True)
-        if settings.sizing == FIT:
+        if settings.target == TEXTURE:
+            layout.prop(settings, "sizing", expand=True)
+        if settings.target == AUTOMATIC:
+            pass  # the tolerance, which is above, decides
+        elif settings.sizing == FIT:
             traces = METHODS[settings.method].traces
             if not (settings.quality != RAYS if traces else settings.lamps):  # else it is above already
                 layout.prop(settings, "tolerance")

@@ -44,6 +44,21 @@ def test_options_that_do_not_fit_are_refused(refused, blend, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_the_planner_chooses_the_target(run, refused, blend, tmp_path):
+    """A coarse ring wants a texture for what little is inside its faces, and by 0.3 does not."""
+    def report(tolerance, *arguments):
+        done = run("bake", blend, "--object", "Ring", "--texture", "auto", "--json", "--tolerance", tolerance,
+                   *arguments)
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout.splitlines()[-1])
+
+    fine, rough = report(0.01, "--half"), report(0.3, "--out", tmp_path / "out.blend", "--textures", tmp_path / "maps")
+    assert fine["target"] == "texture" and f"a texture of {fine['side']} has them." in fine["plan"]
+    assert rough["target"] == "vertices" and not (tmp_path / "maps").exists()
+    assert "--textures" in refused("bake", blend, "--object", "Ring", "--texture", "auto", "--json",
+                                   "--textures", tmp_path / "maps")
+
+
 def test_gloss(run, blend, tmp_path, exr):
     done = run("bake", blend, "--object", "Ring", "--texture", 32, "--rays", 4, "--gloss", "phong",
                "--out", tmp_path / "out.blend", "--png", tmp_path / "baked.exr")

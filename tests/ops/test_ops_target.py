@@ -87,15 +87,77 @@ def test_a_convex_mesh_and_one_that_is_fine_enough_stay_at_their_vertices(make, 
     assert record(ball).target == "vertices" and record(ball).between_error is None
 
 
-@pytest.mark.parametrize("given", [{"method": "embree"}, {"method": "auto", "quality": "RAYS"},
-                                   {"method": "analytic"}])
-def test_without_a_plan_to_a_tolerance_it_is_vertices(make, automatic, given):
+@pytest.mark.parametrize("given, why", [
+    ({"method": "embree"}, "only the method Automatic"), ({"method": "auto", "quality": "RAYS"}, "no tolerance"),
+    ({"method": "analytic"}, "only the method Automatic"), ({"live": True}, "Live is on")])
+def test_without_a_plan_to_a_tolerance_it_is_vertices_and_says_so(make, automatic, given, why):
     coarse = floor(make, 2)
     table(make)
     for name, value in given.items():
         setattr(automatic, name, value)
     bake(coarse)
     assert record(coarse).target == "vertices" and not coarse.data.uv_layers
+    assert why in record(coarse).plan and why in automatic.target_note()
+    automatic.target = "VERTICES"
+    bake(coarse)
+    assert why not in record(coarse).plan and automatic.target_note() == ""
+
+
+def test_those_that_want_a_texture_can_share_one(make, automatic):
+    from neural_gash_addon.scene import preview, staleness
+    objects = [floor(make, 2), floor(make, 60, "Fine"), floor(make, 2, "Other")]
+    for number, obj in enumerate(objects):
+        obj.location = (3 * number, 0, 0)
+        table(make).location = obj.location
+    bpy.context.view_layer.update()
+    automatic.share = True
+    bake(*objects)
+    records = [record(obj) for obj in objects]
+    assert [found.target for found in records] == ["texture", "vertices", "texture"]
+    assert records[0].side == records[2].side and len(bpy.data.images) == 3
+    assert all(f"a texture of {records[0].side} has them." in records[i].plan for i in (0, 2))
+    assert all(staleness.status(obj) == staleness.CURRENT and preview.is_on(obj) for obj in objects)
+    bake(objects[0])  # alone it has one of its own
+    assert record(objects[0]).target == "texture"
+
+
+def test_your_own_uv_map_is_baked_to(make, automatic):
+    coarse = floor(make, 2)
+    table(make)
+    layer = coarse.data.uv_layers.new(name="Mine")
+    for corner, loop in zip(layer.uv, coarse.data.loops, strict=True):
+        corner.vector = coarse.data.vertices[loop.vertex_index].co.xy
+    automatic.uv_map = "Mine"
+    bake(coarse)
+    assert (record(coarse).target, record(coarse).uv_map) == ("texture", "Mine")
+    assert [layer.name for layer in coarse.data.uv_layers] == ["Mine"]
+
+
+def test_a_sequence_has_its_vertices(make, automatic, tmp_path, monkeypatch):
+    from neural_gash_addon.ops import job
+    coarse = floor(make, 2)
+    table(make)
+    bake(coarse)
+    monkeypatch.setattr(job, "read_normal_maps", None)  # nothing of a texture is read in each frame
+    bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 2
+    automatic.sequence_folder = str(tmp_path)
+    assert bpy.ops.neural_gash.bake_sequence() == {"FINISHED"}
+    assert record(coarse).target == "vertices" and not coarse.data.uv_layers and not bpy.data.images
+
+
+def test_the_panel_shows_what_the_target_needs(make, settings):
+    from .test_ops_registration import _draw
+    make()
+    settings.target, settings.method, settings.quality = "AUTOMATIC", "auto", "TOLERANCE"
+    shown = _draw("settings")
+    assert {"target", "uv_map", "padding", "share", "half", "texture_folder"} <= set(shown)
+    assert not {"sizing", "side", "texels_per_metre"} & set(shown) and shown.count("tolerance") == 1
+    settings.method = "embree"
+    assert "uv_map" not in _draw("settings") and "only the method" in " ".join(_draw("settings"))
+    settings.target = "TEXTURE"
+    assert {"sizing", "side", "uv_map"} <= set(_draw("settings"))
+    settings.target = "VERTICES"
+    assert "uv_map" not in _draw("settings")
 
 
 def test_where_no_uv_map_has_room_it_is_vertices(make, automatic):

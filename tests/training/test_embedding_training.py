@@ -100,7 +100,7 @@ def test_each_configuration_takes_a_step_from_the_command_line(cache, tmp_path, 
     embedding.main()
     assert "3 rooms, 1 held out" in capsys.readouterr().out
     log, = tmp_path.glob("*.csv")
-    assert log.stem.startswith("embedding") and ("full" in log.stem) == (configuration == "full")
+    assert log.stem == {"full": "embedding-full-logarithms", "small": "embedding"}[configuration]
     assert len(losses_of(log)) == 1 and np.isfinite(losses_of(log)).all()
     with monkeypatch.context() as patch:
         patch.setattr(embedding_bake.weights, "FOLDER", tmp_path)
