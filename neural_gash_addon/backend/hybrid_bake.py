@@ -37,8 +37,9 @@ _ROWS = 1 << 14       # whose unshadowed transfer one worker computes at a time
 _SAMPLE = 128         # points at which the error is measured, or a 256th of them if that is more
 _MOST_SAMPLE = 2048
 # Rays of each of two independent traces there, where the bake's are given: as many as those, or twice as many where
-# that is little beside the rays of all points, or those are few. A larger error needs fewer to be measured.
-_TWICE_FROM, _TWICE_TO, _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS = 8192, 8, 4, 128
+# that is little beside the rays of all points. A larger error needs fewer to be measured; but with 4 it comes out too
+# low, perhaps as means over few rays err alike in the sample and in the bake.
+_TWICE_FROM, _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS = 8192, 8, 128
 
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
@@ -150,8 +151,7 @@ class _Work:
         most = count if network else -(-count // 2)
         times = float(np.clip(2 * count / _TWICE_FROM, 1, 2))
         self._sample_size = min(most, max(_SAMPLE, min(count // 256, _MOST_SAMPLE)))
-        least = max(_LEAST_SAMPLE_RAYS, min(2 * rays, _TWICE_TO))
-        self._sample_rays = int(np.clip(round(times * rays), least, _MOST_SAMPLE_RAYS))
+        self._sample_rays = int(np.clip(round(times * rays), _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS))
         if tolerance is not None:
             self._sample_size, self._sample_rays = sample_size(count), pilot_rays(tolerance)
         self.probes = 2 * self._sample_size * self._sample_rays
