@@ -25,7 +25,7 @@ from .transfer import Transfer
 from .workers import default_threads
 
 _PILOT_SHARE = 0.05  # of the progress
-_ROUGH = 0.05    # a tolerance that a look at a merged mesh is exact enough for
+_ROUGH = 0.05    # a tolerance that a look at a merged mesh, with the rays of twice that, is exact enough for
 _MANY = 1 << 18  # points that are baked at a time, where those that are looked at are but some of them
 
 
@@ -102,7 +102,7 @@ def planned(mesh: TriangleMesh, order: int, rays: int | None, tolerance: float |
     with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
         few = merged(mesh, occluders) if scene is None and tolerance >= _ROUGH and dense(mesh, occluders) else None
         if few:
-            rough = yield from look(few.mesh, few.scene, order, tolerance, seed, pool, threads)
+            rough = yield from look(few.mesh, few.scene, order, max(tolerance, 2 * _ROUGH), seed, pool, threads)
             if chosen := without_rays(rough, SAFE):
                 return Planned(chosen[0], None, rough.to_order(chosen[1].order), chosen[1], few)
         if scene is None:
