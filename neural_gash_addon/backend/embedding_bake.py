@@ -41,13 +41,11 @@ def network() -> Any:
     Raises:
         UserError: no torch, or no weights, or not those that were trained.
     """
-    torch = import_torch("embedding")
+    import_torch("embedding")
     from .networks.embedding import FULL, SMALL, Embedding
 
     arrays = weights.load(weights.FOLDER / weights.EMBEDDING)
-    model = Embedding(FULL if len(arrays["encoder.leave.weight"]) == FULL.width else SMALL)
-    model.load_state_dict({key: torch.from_numpy(array.copy()) for key, array in arrays.items()})
-    return model.eval()
+    return weights.filled(Embedding(FULL if len(arrays["encoder.leave.weight"]) == FULL.width else SMALL), arrays)
 
 
 def radiance_network(model: Any) -> Any:
@@ -56,14 +54,9 @@ def radiance_network(model: Any) -> Any:
     Raises:
         UserError: no weights, or not those that were trained.
     """
-    import torch
-
     from .networks.radiance import Radiance
 
-    decoder = Radiance(model.settings)
-    arrays = weights.load(weights.FOLDER / weights.RADIANCE)
-    decoder.load_state_dict({key: torch.from_numpy(array.copy()) for key, array in arrays.items()})
-    return decoder.eval()
+    return weights.filled(Radiance(model.settings), weights.load(weights.FOLDER / weights.RADIANCE))
 
 
 def encoded(scene: LitScene, *, seed: int = 0, threads: int | None = None, occluders: Occluders | None = None,

@@ -90,9 +90,7 @@ def _answer(torch: Any, arrays: dict[str, NDArray[np.float32]], seen: NDArray[np
     def given(*arrays: NDArray) -> list[Any]:
         return [torch.from_numpy(array).to(device) for array in arrays]
 
-    network = paper.Mlp() if known is None else paper.TwoStage()
-    network.load_state_dict({key: torch.from_numpy(array.copy()) for key, array in arrays.items()})
-    network.to(device).eval()
+    network = weights.filled(paper.Mlp() if known is None else paper.TwoStage(), arrays).to(device)
     given_ = given(seen, edges.source, edges.start)
     with torch.no_grad():
         if known is None:

@@ -125,26 +125,20 @@ def in_scale(places: NDArray, occluders: Occluders) -> NDArray[np.float32]:
 
 def network() -> Any:
     """The trained network: networks.sky.SkyEmbedding, in `eval` mode. Raises UserError: no torch or weights."""
-    torch = import_torch("embedding")
+    import_torch("embedding")
     from .networks.embedding import SMALL
     from .networks.sky import SkyEmbedding
 
-    model = SkyEmbedding(SMALL)
-    arrays = weights.load(weights.FOLDER / weights.SKY)
-    model.load_state_dict({key: torch.from_numpy(array.copy()) for key, array in arrays.items()})
-    return model.eval()
+    return weights.filled(SkyEmbedding(SMALL), weights.load(weights.FOLDER / weights.SKY))
 
 
 def reflecting() -> Any:
     """The trained decoder of what bounces: networks.reflected.Reflected, in `eval` mode. Raises as `network`."""
-    torch = import_torch("embedding")
+    import_torch("embedding")
     from .networks.embedding import SMALL
     from .networks.reflected import Reflected
 
-    model = Reflected(SMALL)
-    arrays = weights.load(weights.FOLDER / weights.BOUNCES)
-    model.load_state_dict({key: torch.from_numpy(array.copy()) for key, array in arrays.items()})
-    return model.eval()
+    return weights.filled(Reflected(SMALL), weights.load(weights.FOLDER / weights.BOUNCES))
 
 
 class Sky:

@@ -11,6 +11,7 @@ import json
 import struct
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +66,14 @@ def load(path: Path) -> dict[str, NDArray[np.float32]]:
     return {name: np.frombuffer(data, "<f4", (to - start) // 4, 8 + length + start).reshape(entry["shape"])
             for name, entry in header.items() if name != "__metadata__"
             for start, to in [entry["data_offsets"]]}
+
+
+def filled(module: Any, arrays: dict[str, NDArray[np.float32]]) -> Any:
+    """A torch module with copies of these arrays as its weights, in `eval` mode."""
+    import torch
+
+    module.load_state_dict({key: torch.from_numpy(array.copy()) for key, array in arrays.items()})
+    return module.eval()
 
 
 def save_hybrid(path: Path, network: Network) -> None:
