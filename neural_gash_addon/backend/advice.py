@@ -22,6 +22,7 @@ from .raycast import Occluders
 from .texels import texel_points
 
 _POINTS = 96
+_FACES = 8192         # some of them all, among which points are chosen by area
 _MOST_RAYS = 32       # of each trace of them,
 _OWN_NOISE = 1.25     # of the tolerance: what corners that just keep to it may differ by inside faces that hold no edge
 _DARK = 1e-3          # of the transfer in the open: less than this on the whole is not seen
@@ -47,16 +48,20 @@ def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray, or
     Returns:
         None where the mesh does not say which points its faces lie between, or it is dark.
     """
-    areas = _areas(mesh)
-    if mesh.domain == TEXEL or (mesh.domain == CORNER and mesh.corners is None) or not areas.sum() > 0:
+    if mesh.domain == TEXEL or (mesh.domain == CORNER and mesh.corners is None):
         return None
-    rng = np.random.default_rng([seed, 6])
-    faces, u, v = sampling.on_triangles(np.cumsum(areas), rng.random((2, _POINTS)))
+    rng, count = np.random.default_rng([seed, 6]), len(mesh.triangles)
+    some = rng.integers(count, size=_FACES) if count > 2 * _FACES else np.arange(count)
+    areas = _areas(mesh.positions, mesh.triangles[some])
+    if not areas.sum() > 0:
+        return None
+    chosen, u, v = sampling.on_triangles(np.cumsum(areas), rng.random((2, _POINTS)))
+    faces = some[chosen]
     weights = np.stack([1 - u - v, u, v], 1)
-    some = _points(mesh, faces, weights)
-    one, two = yield from _traced(some, scene, order, min(pilot_rays(tolerance), _MOST_RAYS), rng, threads)
+    seen = _points(mesh, faces, weights)
+    one, two = yield from _traced(seen, scene, order, min(pilot_rays(tolerance), _MOST_RAYS), rng, threads)
     energy = float((one * two).sum())
-    if energy <= _DARK ** 2 * float(np.square(sh.cosine_lobe(some.normals, order)).sum()):
+    if energy <= _DARK ** 2 * float(np.square(sh.cosine_lobe(seen.normals, order)).sum()):
         return None
     baked = np.einsum("nc,nck->nk", weights, coefficients[_of_corner(mesh, faces)].astype(np.float64))
     return float(max(float(((one - baked) * (two - baked)).sum()), 0.0) / energy) ** 0.5
@@ -81,11 +86,10 @@ def _of_corner(mesh: TriangleMesh, faces: NDArray) -> NDArray[np.int32]:
     return mesh.elements[of_corner[faces]]
 
 
-def _areas(mesh: TriangleMesh) -> NDArray[np.float64]:
-    one, two, three = mesh.triangles.T
+def _areas(positions: NDArray, triangles: NDArray) -> NDArray[np.float64]:
+    one, two, three = triangles.T
     # axis by axis: NumPy is slow along short last ones
-    (ax, bx), (ay, by), (az, bz) = ((axis[two] - axis[one], axis[three] - axis[one])
-                                    for axis in np.ascontiguousarray(mesh.positions.T))
+    (ax, bx), (ay, by), (az, bz) = ((axis[two] - axis[one], axis[three] - axis[one]) for axis in positions.T)
     return np.sqrt((ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2) / 2
 
 

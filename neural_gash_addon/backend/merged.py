@@ -4,7 +4,8 @@
 Embree's scene of a dense mesh takes longer (1 µs a triangle, most of it copying) than a bake that wants none. Shadows
 as a whole hardly change where all vertices of a cell are one, at their mean (Rossignac and Borrel 1993,
 "Multi-resolution 3D approximations for rendering complex scenes"): where they were less than a half, on five meshes of
-the training set of 35,000 to 60,000 triangles, 0.93 to 1.15 times as large. Of small meshes that is not so.
+the training set of 35,000 to 60,000 triangles, 0.93 to 1.15 times as large. Of small meshes that is not so. Where cells
+are many (blobs, and surfaces within surfaces) larger ones are taken.
 """
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ from .raycast import Geometry, Occluders
 
 DENSE = 1 << 15  # triangles from which on this is quicker than a scene, and near enough
 SAFE = 1.1       # what shadows may be larger by than they seem
-_CELLS = 48      # along the longest side of each part
+_CELLS = 48      # along the longest side of each part, at most,
+_MOST = 4096     # and so many vertices, about: their scene takes 6 ms
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,52 +45,51 @@ def dense(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> bool:
 
 def merged(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> Merged | None:
     """Merge the mesh and what else blocks. None where nothing is left of the mesh."""
-    box = _Box(mesh.positions)
-    cells = box.cells(mesh.positions)
-    places, number = _means(mesh.positions, cells)
-    triangles = _left(number, cells, mesh.triangles)
+    cells = _Cells(mesh.positions)
+    triangles = cells.left(mesh.triangles)
     if not len(triangles):
         return None
-    others = []
-    for positions, parts in occluders:
-        if len(parts):
-            here = _Box(positions).cells(positions)
-            means, of = _means(positions, here)
-            others.append((means, _left(of, here, parts)))
-    moved = places[number[cells if mesh.points is mesh.positions else box.cells(mesh.points)]]
-    return Merged(replace(mesh, points=moved), places, triangles,
-                  Occluders([(places, triangles), *others], mesh.resolution))
+    others = [(own.means, own.left(parts)) for own, parts in
+              ((_Cells(positions), parts) for positions, parts in occluders if len(parts))]
+    moved = cells.means[cells.own if mesh.points is mesh.positions else cells.of(mesh.points)]
+    return Merged(replace(mesh, points=moved), cells.means, triangles,
+                  Occluders([(cells.means, triangles), *others], mesh.resolution))
 
 
-class _Box:
-    """A grid about positions (V, 3)."""
+class _Cells:
+    """The cells of a grid about positions (V, 3) that have any."""
 
     def __init__(self, positions: NDArray) -> None:
         axes = np.asarray(positions).T  # by axis: NumPy is slow along short last ones
         self._low = [float(axis.min()) for axis in axes]
-        extent = max(float(axis.max()) - low for axis, low in zip(axes, self._low, strict=True))
-        self._times = _CELLS / extent if extent > 0 else 0.0
+        self._extent = max(float(axis.max()) - low for axis, low in zip(axes, self._low, strict=True))
+        self._side = _CELLS
+        here = self._places(positions)
+        counts = np.bincount(here, minlength=self._side ** 3)
+        if (many := np.count_nonzero(counts)) > _MOST:  # on a surface, their number goes with the square of the side
+            self._side = int(_CELLS * (_MOST / many) ** 0.5)
+            here = self._places(positions)
+            counts = np.bincount(here, minlength=self._side ** 3)
+        filled = np.flatnonzero(counts)
+        self._number = np.zeros(self._side ** 3, np.int32)
+        self._number[filled] = np.arange(len(filled), dtype=np.int32)
+        sums = np.stack([np.bincount(here, axis, minlength=self._side ** 3)[filled] for axis in axes], 1)
+        self.means = sums / counts[filled, None]  # (M, 3) of the positions of each cell
+        self.own = self._number[here]             # (V,) the cell of each position
 
-    def cells(self, positions: NDArray) -> NDArray[np.int32]:
-        """(N,) the cell of each, within the box."""
-        cells = np.zeros(len(positions), np.int32)
-        for axis, low in zip(np.asarray(positions).T, self._low, strict=True):
-            cells = cells * _CELLS + np.minimum(((axis - low) * self._times).astype(np.int32), _CELLS - 1)
-        return cells
+    def of(self, points: NDArray) -> NDArray[np.int32]:
+        """(N,) the cell of each point, which is one of the positions."""
+        return self._number[self._places(points)]
 
+    def left(self, triangles: NDArray) -> NDArray[np.int32]:
+        """(M, 3) those of triangles (F, 3) whose corners are in three cells."""
+        corners = self.own[triangles]
+        one, two, three = corners.T
+        return corners[(one != two) & (two != three) & (three != one)]
 
-def _means(positions: NDArray, cells: NDArray[np.int32]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Means (M, 3) of the positions of each cell that has any; and its number among those, of every cell."""
-    counts = np.bincount(cells, minlength=_CELLS ** 3)
-    filled = np.flatnonzero(counts)
-    number = np.zeros(_CELLS ** 3, np.int32)
-    number[filled] = np.arange(len(filled), dtype=np.int32)
-    sums = np.stack([np.bincount(cells, axis, minlength=_CELLS ** 3)[filled] for axis in np.asarray(positions).T], 1)
-    return sums / counts[filled, None], number
-
-
-def _left(number: NDArray[np.int32], cells: NDArray[np.int32], triangles: NDArray) -> NDArray[np.int32]:
-    """(M, 3) the triangles whose corners are in three cells."""
-    corners = number[cells][triangles]
-    one, two, three = corners.T
-    return corners[(one != two) & (two != three) & (three != one)]
+    def _places(self, points: NDArray) -> NDArray[np.int32]:
+        places = np.zeros(len(points), np.int32)
+        times = self._side / self._extent if self._extent > 0 else 0.0
+        for axis, low in zip(np.asarray(points).T, self._low, strict=True):
+            places = places * self._side + np.minimum(((axis - low) * times).astype(np.int32), self._side - 1)
+        return places

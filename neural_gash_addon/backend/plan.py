@@ -57,16 +57,18 @@ def nothing_blocks(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> bool:
 
     False also where it would take long to say.
     """
-    parts = [(mesh.positions, mesh.triangles), *((p, t) for p, t in occluders if len(t))]
-    vertices = np.concatenate([np.asarray(p, np.float64)[used(p, t)] for p, t in parts])
+    parts = [(np.asarray(p, np.float64), t) for p, t in ((mesh.positions, mesh.triangles), *occluders) if len(t)]
     lit = mesh.lit()
-    points, normals = mesh.points[lit], mesh.normals[lit]
     # a handful first: almost every mesh is found out by them
-    level = _LEVEL * max(float(np.ptp(axis)) for axis in vertices.T)
-    some, few = points[::len(points) // 32 + 1], vertices[::len(vertices) // 4096 + 1]
-    height = normals[::len(points) // 32 + 1]
-    if (product(height, few.T).max(1, initial=-np.inf) > (height * some).sum(1) + level).any():
+    few = np.concatenate([p[t[::len(t) // 4096 + 1, 0]] for p, t in parts])
+    level = _LEVEL * max(float(axis.max() - axis.min()) for axis in np.concatenate([p for p, _ in parts]).T)
+    chosen = lit[::len(lit) // 32 + 1]
+    height = mesh.normals[chosen]
+    if (product(height, few.T).max(1, initial=-np.inf) > (height * mesh.points[chosen]).sum(1) + level).any():
         return False
+    vertices = np.concatenate([p[used(p, t)] for p, t in parts])
+    level = _LEVEL * max(float(np.ptp(axis)) for axis in vertices.T)
+    points, normals = mesh.points[lit], mesh.normals[lit]
     vertices = vertices[morton_order(vertices)]
     balls = -(-len(vertices) // _LEAF)
     if len(points) * balls > _MOST_PAIRS:

@@ -22,14 +22,15 @@ def looked(mesh, scene, tolerance=0.02):
         return methods.run(pilot.look(mesh, scene, 3, tolerance, 0, pool, 1))
 
 
-@pytest.mark.parametrize("smooth", (True, False))
+@pytest.mark.parametrize("smooth, larger", ((True, 1.1), (False, 1.8)))
 @pytest.mark.parametrize("depth", (0.15, 0.25))
-def test_shadows_seem_as_large_as_they_are(depth, smooth):
+def test_shadows_seem_as_large_as_they_are(depth, smooth, larger):
+    """Or larger, with flat shading, whose normals are not those of the cells; then they are traced."""
     mesh = TriangleMesh.from_triangles(*bumpy(depth, 6 if smooth else 5), smooth=smooth)
     few = merged.merged(mesh, ())
     assert few.mesh.points.shape == mesh.points.shape and len(few.triangles) < len(mesh.triangles)
     true = looked(mesh, Occluders([(mesh.positions, mesh.triangles)], mesh.resolution)).blocked
-    assert looked(few.mesh, few.scene).blocked == pytest.approx(true, rel=0.1) and true > 0.04
+    assert 0.95 * true < looked(few.mesh, few.scene).blocked < larger * true and true > 0.04
 
 
 def test_points_move_to_the_mean_of_their_cell():
@@ -44,6 +45,15 @@ def test_points_move_to_the_mean_of_their_cell():
         np.testing.assert_allclose(few.mesh.points[row], np.mean(of, 0), atol=1e-9)
     kept = sum(len({cells[v] for v in triangle}) == 3 for triangle in triangles)
     assert len(few.triangles) == kept
+
+
+def test_cells_are_larger_where_they_would_be_many(monkeypatch):
+    mesh = TriangleMesh.from_triangles(*bumpy(0.2))
+    few = merged.merged(mesh, ())
+    monkeypatch.setattr(merged, "_MOST", 1 << 20)
+    assert len(merged.merged(mesh, ()).vertices) > 8000
+    assert 3500 < len(few.vertices) < 4700  # as asked for, on a surface
+    assert len(np.unique(few.mesh.points, axis=0)) == len(few.vertices)
 
 
 def test_no_scene_is_built_where_shadows_are_less_than_the_tolerance(monkeypatch):
