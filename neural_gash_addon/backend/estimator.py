@@ -26,9 +26,9 @@ SETS = 16
 MAX_RAYS = 4096
 RATE = 1.5              # the variance falls as rays**-RATE (scrambled nets, measured)
 RAYS_PER_JOB = 1 << 16  # about 15 ms of one thread: short enough to stop at once, long enough to be efficient
-# Directions up to which a job mixes points of all sets, if there are more rays than one job has: with more, one matrix
-# product for all points of a set is quicker, with fewer, not having to go from set to set is.
-_MIXED = 16
+# Directions up to which a job mixes points of all sets, if there are more rays than one job has, or not: with more, one
+# matrix product for all points of a set is quicker, with fewer, not having to go from set to set is.
+_MIXED, _MIXED_ONE_JOB = 16, 64
 _MIXED_RAYS_PER_JOB = 1 << 14  # with fewer, handing over to another thread costs more than it saves
 
 _TURNED_AT_ONCE = 2048  # points rotated by one worker at a time
@@ -115,7 +115,7 @@ class BlockedEstimator:
         size = max(1, RAYS_PER_JOB // (stop - start))
         set_of_row = self._set_of_point[points]
         harmonics = self._harmonics(start, stop)
-        if stop - start <= _MIXED or len(points) * (stop - start) <= RAYS_PER_JOB:
+        if stop - start <= (_MIXED if len(points) * (stop - start) > RAYS_PER_JOB else _MIXED_ONE_JOB):
             size = max(1, _MIXED_RAYS_PER_JOB // (stop - start))
             every = self._sets(stop)[:, start:stop].astype(np.float32)
             for part in np.array_split(np.arange(len(points)), -(-len(points) // size)):

@@ -106,42 +106,39 @@ def filtered(places: NDArray, normals: NDArray, orders: Sequence[NDArray], block
     """
     count, terms = blocked.shape
     known = np.concatenate([places.T, normals.T], dtype=np.float32)
-    now = blocked
-    for number, (order, layers) in enumerate(zip(orders, network, strict=True)):
-        first, last = number == 0, number == len(network) - 1
-        out = np.empty((count + 1, terms if last else terms + 1), np.float32)
+    even = unshadowed.T[1:] / np.float32(FULL)  # NumPy is quick along long last axes
+    now = np.empty((terms + 1, count), np.float32)
+    now[:terms] = blocked.T
+    now[1:terms] -= now[0] * even
+    now[terms] = 1  # it counts, in sums over neighbours
+    for order, layers in zip(orders, network, strict=True):
+        out = np.empty((terms + 1, count + 1), np.float32)
+        out[terms] = 1
         every = blocks(order)
         into = every.copy()
-        into[-1:, :-len(order) % every.shape[1]] = count  # the last row is for what the block before has already
+        into[-1:, :-len(order) % every.shape[1]] = count  # the last column is for what the block before has already
         step = int(np.clip(len(every) // 4 + 1, *_BLOCKS))  # work for all threads, where it is enough
 
         def part(start: int, now: NDArray = now, out: NDArray = out, every: NDArray = every, into: NDArray = into,
-                 step: int = step, layers: Sequence[Layer] = layers, first: bool = first, last: bool = last) -> None:
-            rows, targets = every[start:start + step], into[start:start + step]
-            if first or last:
-                even = unshadowed.take(rows, 0)[..., 1:]
-                even /= np.float32(FULL)
-            if first:  # the last column counts, in sums over neighbours
-                values = np.ones((*rows.shape, terms + 1), np.float32)
-                now.take(rows, 0, out=values[..., :terms], mode="clip")
-                values[..., 1:terms] -= values[..., :1] * even
-            else:
-                values = now.take(rows, 0)
-            seen = values[..., 0].any(1)
+                 step: int = step, layers: Sequence[Layer] = layers) -> None:
+            rows, targets = every[start:start + step], into[start:start + step].ravel()
+            values = now.take(rows, 1)
+            seen = values[0].any(1)
             if seen.all():
                 here = known.take(rows, 1)
-                values[..., :terms] = mixed(here[:3], here[3:], values, rays, layers)
-            elif seen.any():
-                here = known.take(rows[seen], 1)
-                values[seen, :, :terms] = mixed(here[:3], here[3:], values[seen], rays, layers)
-            if last:
-                values = values[..., :terms]
-                values[..., 1:] += values[..., :1] * even
-            out[targets.ravel()] = values.reshape(-1, values.shape[2])
+                found = mixed(here[:3], here[3:], values, rays, layers)
+            else:
+                found = values[:terms]
+                if seen.any():
+                    here = known.take(rows[seen], 1)
+                    found[:, seen] = mixed(here[:3], here[3:], np.ascontiguousarray(values[:, seen]), rays, layers)
+            for row, column in zip(out, found.reshape(terms, -1), strict=False):
+                row[targets] = column
 
         list(pool.map(part, range(0, len(every), step)))
-        now = out
-    return now[:-1]
+        now = out[:, :count]
+    now[1:terms] += now[0] * even
+    return now[:terms].T
 
 
 def between(some: NDArray[np.float32], unshadowed: NDArray[np.float32], pool: ThreadPoolExecutor
@@ -190,19 +187,18 @@ def mixed(places: NDArray[np.float32], normals: NDArray[np.float32], values: NDA
 
     Args:
         places, normals: (3, b, n): NumPy is quick along long last axes.
-        values: (b, n, K + 1), of which the last is 1. rays: from each point.
+        values: (K + 1, b, n), of which the last is 1. rays: from each point.
     Returns:
-        (b, n, K).
+        (K, b, n).
     """
-    count, points = places.shape[1:]
-    terms = values.shape[2] - 1
+    terms, count, points = len(values) - 1, *places.shape[1:]
     bands = sh.order_of(terms)
     away = places - (np.einsum("xbn->xb", places) * np.float32(1 / points))[..., None]
     squares = _dot(away, away)
     size = np.sqrt(np.einsum("bn->b", squares) * np.float32(1 / points)) + np.float32(1e-9)
     away /= size[:, None]
     squares /= np.square(size)[:, None]
-    seen = values[..., :4].transpose(2, 0, 1).copy()
+    seen = values[:4].copy()
     context = _context(size, normals, seen, rays)
     distance, plane, facing, first, second, *own = perceptron(context, layers, bands).T[..., None]
     # log w, but for the tangent planes: what depends on one point only, and products of two
@@ -210,27 +206,29 @@ def mixed(places: NDArray[np.float32], normals: NDArray[np.float32], values: NDA
     seen[1:] *= np.sqrt(second)
     alone = distance * squares
     alone += _dot(seen, seen)
-    left, right = np.empty((2, 12, count, points), np.float32)
-    np.multiply(away, 2 * distance, out=left[:3])
-    np.multiply(normals, facing, out=left[3:6])
-    np.multiply(seen, 2, out=left[6:10])
-    np.subtract(-facing, alone, out=left[10])
-    left[11] = right[10] = 1
-    right[:3], right[3:6], right[6:10] = away, normals, seen
-    np.negative(alone, out=right[11])
-    weight = left.transpose(1, 2, 0) @ right.transpose(1, 0, 2)
+    one, other = np.empty((2, 12, count, points), np.float32)
+    np.multiply(away, 2 * distance, out=one[:3])
+    np.multiply(normals, facing, out=one[3:6])
+    np.multiply(seen, 2, out=one[6:10])
+    np.subtract(-facing, alone, out=one[10])
+    one[11] = other[10] = 1
+    other[:3], other[3:6], other[6:10] = away, normals, seen
+    np.negative(alone, out=other[11])
+    weight = other.transpose(1, 2, 0) @ one.transpose(1, 0, 2)  # (b, other, one)
     # how far the other lies off one's tangent plane
-    np.multiply(normals, np.sqrt(plane), out=left[:3])
-    np.negative(_dot(left[:3], away), out=left[3])
-    right[3] = 1
-    height = left[:4].transpose(1, 2, 0) @ right[:4].transpose(1, 0, 2)
+    np.multiply(normals, np.sqrt(plane), out=one[:3])
+    np.negative(_dot(one[:3], away), out=one[3])
+    other[3] = 1
+    height = other[:4].transpose(1, 2, 0) @ one[:4].transpose(1, 0, 2)
     weight -= np.square(height, out=height)
-    sums = np.exp(weight, out=weight) @ values
-    mine = np.repeat(np.concatenate(own, 1), [2 * band + 1 for band in range(bands)], 1)[:, None]
-    mine *= np.float32((HALF + rays) / HALF)
-    out = mine * values[..., :terms]
-    out += sums[..., :terms]
-    out /= mine + sums[..., terms:]
+    sums = (values.transpose(1, 0, 2) @ np.exp(weight, out=weight)).transpose(1, 0, 2)
+    out = np.empty((terms, count, points), np.float32)
+    for band, mine in enumerate(own):
+        mine = mine * np.float32((HALF + rays) / HALF)
+        here = slice(band ** 2, (band + 1) ** 2)
+        np.multiply(values[here], mine, out=out[here])
+        out[here] += sums[here]
+        out[here] /= mine + sums[terms]
     return out
 
 
