@@ -88,7 +88,7 @@ def _turned(axes: NDArray, rows: NDArray) -> NDArray[np.float64]:
     return np.einsum("xy,yn->xn", axes, rows).T
 
 
-def filtered(places: NDArray, normals: NDArray, orders: Sequence[NDArray], blocked: NDArray[np.float32],
+def filtered(places: NDArray, normals: NDArray, orders: Sequence[NDArray | None], blocked: NDArray[np.float32],
              unshadowed: NDArray[np.float32], rays: int, network: Network, pool: ThreadPoolExecutor
              ) -> NDArray[np.float32]:
     """The blocked part of all points after all passes.
@@ -98,7 +98,7 @@ def filtered(places: NDArray, normals: NDArray, orders: Sequence[NDArray], block
     be here if its sky were blocked evenly. Exact where all is blocked, or nothing.
 
     Args:
-        places, normals: (N, 3) from `placed`. orders: from `curves`.
+        places, normals: (N, 3) from `placed`. orders: from `curves`; None: along the points as they are.
         blocked: (N, K), traced with `rays` rays from each point. unshadowed: (N, K).
         network: from `weights.load_hybrid`.
     Returns:
@@ -114,31 +114,40 @@ def filtered(places: NDArray, normals: NDArray, orders: Sequence[NDArray], block
     for order, layers in zip(orders, network, strict=True):
         out = np.empty((terms + 1, count + 1), np.float32)
         out[terms] = 1
-        every = blocks(order)
+        every = blocks(np.arange(count) if order is None else order)
+        size, rest = every.shape[1], count % every.shape[1]
         into = every.copy()
-        into[-1:, :-len(order) % every.shape[1]] = count  # the last column is for what the block before has already
+        into[-1:, :-count % size] = count  # the last column is for what the block before has already
         step = int(np.clip(len(every) // 4 + 1, *_BLOCKS))  # work for all threads, where it is enough
 
-        def part(start: int, now: NDArray = now, out: NDArray = out, every: NDArray = every, into: NDArray = into,
-                 step: int = step, layers: Sequence[Layer] = layers) -> None:
-            rows, targets = every[start:start + step], into[start:start + step].ravel()
-            values = now.take(rows, 1)
+        def part(start: int, now: NDArray = now, out: NDArray = out, order: NDArray | None = order,
+                 every: NDArray = every, into: NDArray = into, size: int = size, rest: int = rest, step: int = step,
+                 layers: Sequence[Layer] = layers) -> None:
+            rows, along = every[start:start + step], slice(start * size, (start + step) * size)
+            straight = order is None and (not rest or start + step < len(every))  # nothing is to be fetched
+            values, here = (a[:, along].reshape(len(a), -1, size) if straight else a.take(rows, 1)
+                            for a in (now[:, :count], known))
             seen = values[0].any(1)
             if seen.all():
-                here = known.take(rows, 1)
                 found = mixed(here[:3], here[3:], values, rays, layers)
             else:
-                found = values[:terms]
+                found = values[:terms].copy()
                 if seen.any():
-                    here = known.take(rows[seen], 1)
-                    found[:, seen] = mixed(here[:3], here[3:], np.ascontiguousarray(values[:, seen]), rays, layers)
-            for row, column in zip(out, found.reshape(terms, -1), strict=False):
-                row[targets] = column
+                    values, here = values[:, seen], here[:, seen]
+                    found[:, seen] = mixed(here[:3], here[3:], values, rays, layers)
+            found = found.reshape(terms, -1)
+            if straight:
+                out[:terms, along.start:along.start + found.shape[1]] = found
+            else:
+                targets = into[start:start + step].ravel()
+                for row, column in zip(out, found, strict=False):
+                    row[targets] = column
 
         list(pool.map(part, range(0, len(every), step)))
-        now = out[:, :count]
-    now[1:terms] += now[0] * even
-    return now[:terms].T
+        now = out
+    found = now[:terms, :count]
+    found[1:] += found[0] * even
+    return found.T
 
 
 def between(some: NDArray[np.float32], unshadowed: NDArray[np.float32], pool: ThreadPoolExecutor
@@ -193,13 +202,14 @@ def mixed(places: NDArray[np.float32], normals: NDArray[np.float32], values: NDA
     """
     terms, count, points = len(values) - 1, *places.shape[1:]
     bands = sh.order_of(terms)
-    away = places - (np.einsum("xbn->xb", places) * np.float32(1 / points))[..., None]
+    mean = np.full(points, 1 / points, np.float32)  # of a block, as a product
+    away = places - (places @ mean)[..., None]
     squares = _dot(away, away)
-    size = np.sqrt(np.einsum("bn->b", squares) * np.float32(1 / points)) + np.float32(1e-9)
+    size = np.sqrt(squares @ mean) + np.float32(1e-9)
     away /= size[:, None]
     squares /= np.square(size)[:, None]
     seen = values[:4].copy()
-    context = _context(size, normals, seen, rays)
+    context = _context(size, normals, seen, rays, mean)
     distance, plane, facing, first, second, *own = perceptron(context, layers, bands).T[..., None]
     # log w, but for the tangent planes: what depends on one point only, and products of two
     seen[0] *= np.sqrt(first)
@@ -222,13 +232,11 @@ def mixed(places: NDArray[np.float32], normals: NDArray[np.float32], values: NDA
     height = other[:4].transpose(1, 2, 0) @ one[:4].transpose(1, 0, 2)
     weight -= np.square(height, out=height)
     sums = (values.transpose(1, 0, 2) @ np.exp(weight, out=weight)).transpose(1, 0, 2)
-    out = np.empty((terms, count, points), np.float32)
-    for band, mine in enumerate(own):
-        mine = mine * np.float32((HALF + rays) / HALF)
-        here = slice(band ** 2, (band + 1) ** 2)
-        np.multiply(values[here], mine, out=out[here])
-        out[here] += sums[here]
-        out[here] /= mine + sums[terms]
+    mine = np.stack(own) * np.float32((HALF + rays) / HALF)  # (bands, b, 1)
+    out = np.repeat(mine, 2 * np.arange(bands) + 1, 0) * values[:terms]
+    out += sums[:terms]
+    for band, total in enumerate(mine + sums[terms]):
+        out[band ** 2:(band + 1) ** 2] /= total
     return out
 
 
@@ -240,23 +248,23 @@ def _dot(one: NDArray[np.float32], two: NDArray[np.float32]) -> NDArray[np.float
     return out
 
 
-def _context(size: NDArray[np.float32], normals: NDArray[np.float32], seen: NDArray[np.float32], rays: int
-             ) -> NDArray[np.float32]:
+def _context(size: NDArray[np.float32], normals: NDArray[np.float32], seen: NDArray[np.float32], rays: int,
+             mean: NDArray[np.float32]) -> NDArray[np.float32]:
     """(b, CONTEXT) of blocks: their size (b,), how their points face (3, b, n), what they see (4, b, n)."""
-    points = seen.shape[2]
-    share = np.float32(1 / points)
-    mean = np.einsum("kbn->kb", seen) * share
-    apart = seen - mean[..., None]
-    varying = np.einsum("kbn,kbn->kb", apart, apart) * share
-    out = np.empty((len(size), CONTEXT), np.float32)
-    out[:, 0] = 0.5 * np.log(size)
-    out[:, 1] = 2 * np.square(np.einsum("xbn->xb", normals) * share).sum(0)
-    out[:, 2] = 4 * mean[0]
-    out[:, 3] = 0.5 * np.log(varying[0] + np.float32(TINY))
-    out[:, 4] = 0.5 * np.log(varying[1:].sum(0) + np.float32(TINY))
-    out[:, 5] = 0.5 * np.log(rays)
-    out[:, 6] = np.log(points) - 3
-    return out
+    average = seen @ mean
+    apart = seen - average[..., None]
+    varying = np.square(apart, out=apart) @ mean
+    out = np.empty((CONTEXT, len(size)), np.float32)
+    out[0], out[3] = size, varying[0] + np.float32(TINY)
+    out[4] = varying[1:].sum(0) + np.float32(TINY)
+    out[1] = 2 * np.square(normals @ mean).sum(0)
+    out[2] = 4 * average[0]
+    for row in out[0], out[3], out[4]:
+        np.log(row, out=row)
+        row *= np.float32(0.5)
+    out[5] = 0.5 * np.log(rays)
+    out[6] = np.log(len(mean)) - 3
+    return out.T
 
 
 def perceptron(seen: NDArray[np.float32], layers: Sequence[Layer], bands: int) -> NDArray[np.float32]:

@@ -134,9 +134,9 @@ class _Work:
             first = morton_order(places)
             self.lit = lit[first]
 
-            def walked() -> tuple[NDArray, NDArray, tuple[NDArray, NDArray]]:
+            def walked() -> tuple[NDArray, NDArray, tuple[None, NDArray]]:
                 here = places[first]
-                return here, normals[first], (np.arange(count), second_curve(here))
+                return here, normals[first], (None, second_curve(here))
 
             self._placed = pool.submit(walked)  # beside the rest, which waits for rays
         self.unshadowed = np.empty((count, sh.coefficient_count(order)), np.float32)  # (n, K), `filled`
