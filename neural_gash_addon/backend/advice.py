@@ -8,7 +8,6 @@ to be is measured on its own UV map (`resolution`).
 from __future__ import annotations
 
 from collections.abc import Generator
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from .pilot import pilot_rays, twice
 from .raster import Coverage
 from .raycast import Occluders
 from .texels import texel_points
+from .workers import workers
 
 _POINTS = 96
 _FACES = 8192         # some of them all, among which points are chosen by area
@@ -96,7 +96,7 @@ def _areas(positions: NDArray, triangles: NDArray) -> NDArray[np.float64]:
 def _traced(points: TriangleMesh, scene: Occluders, order: int, rays: int, rng: np.random.Generator, threads: int
             ) -> Generator[float, None, tuple[NDArray, NDArray]]:
     """Transfer of points, twice, with rays of their own. Yields progress."""
-    with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+    with workers(threads, 2 * len(points.points) * rays) as pool:
         blocked = yield from twice(points, scene, order, rays, int(rng.integers(2**31)), pool, threads)
     unshadowed = sh.cosine_lobe(points.normals, order)
     return unshadowed - blocked[0], unshadowed - blocked[1]

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,12 +16,12 @@ from . import spherical_harmonics as sh
 from .bands import Bands, all_of, of_open_sky
 from .geometry import TriangleMesh
 from .merged import SAFE, Merged, dense, merged
-from .pilot import Pilot, look
+from .pilot import Pilot, look, looking
 from .plan import Plan, cheapest, nothing_blocks, traced_bands, unshadowed, unshadowed_bands
 from .progress import scaled
 from .raycast import Geometry, Occluders
 from .transfer import Transfer
-from .workers import default_threads
+from .workers import default_threads, workers
 
 _PILOT_SHARE = 0.05  # of the progress
 _ROUGH = 0.05    # a tolerance that a look at a merged mesh, with the rays of twice that, is exact enough for
@@ -99,7 +98,7 @@ def planned(mesh: TriangleMesh, order: int, rays: int | None, tolerance: float |
     def with_rays(found: Pilot) -> tuple[Plan, Bands]:
         return (cheapest(found, points, enough), every) if whole else traced_bands(found, points, order, enough)
 
-    with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+    with workers(threads, looking(points, tolerance)) as pool:
         few = merged(mesh, occluders) if scene is None and tolerance >= _ROUGH and dense(mesh, occluders) else None
         if few:
             rough = yield from look(few.mesh, few.scene, order, max(tolerance, 2 * _ROUGH), seed, pool, threads)
@@ -121,6 +120,6 @@ def enough_bands(mesh: TriangleMesh, order: int, tolerance: float, occluders: Se
     if nothing_blocks(mesh, occluders):
         return of_open_sky(order, tolerance)
     threads = threads or default_threads()
-    with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+    with workers(threads, looking(len(mesh.points), tolerance)) as pool:
         pilot = yield from look(mesh, scene, order, tolerance, seed, pool, threads)
     return traced_bands(pilot, _MANY, order, tolerance)[1]

@@ -8,10 +8,8 @@ bounces with rays of their own, a chunk at a time.
 """
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +22,7 @@ from .patches import Patches
 from .pictures import Picture
 from .raycast import Geometry, Occluders
 from .transfer import Transfer
-from .workers import default_threads
+from .workers import default_threads, results, workers
 
 PATCHES = 8192        # about as many; more sharpen the light that bounces near edges and shadows
 PATCH_RAYS = 128
@@ -172,7 +170,7 @@ class Bounces:
             met = self.met[start:start + step]
             out[start:start + step] = padded[met.ravel()].reshape(*met.shape, -1).mean(1, dtype=np.float64)
 
-        with ThreadPoolExecutor(self._threads) as pool:
+        with workers(self._threads) as pool:
             list(pool.map(part, range(0, len(self.met), step)))
         return out
 
@@ -272,17 +270,6 @@ def _size(values: NDArray, areas: NDArray) -> float:
 
 def spread(work: Callable, jobs: list, threads: int) -> Generator[float, None, None]:
     """Do the jobs on some threads, a few at a time, yielding the share that is done."""
-    stop = threading.Event()
-
-    def guarded(job: object) -> None:
-        if not stop.is_set():
-            work(job)
-
-    with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
-        try:
-            futures = [pool.submit(guarded, job) for job in jobs]
-            for number, future in enumerate(futures):
-                future.result()
-                yield (number + 1) / len(jobs)
-        finally:
-            stop.set()
+    with workers(threads) as pool:
+        for number, _ in enumerate(results(pool, threads, ((job,) for job in jobs), work)):
+            yield (number + 1) / len(jobs)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Generator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from .progress import scaled
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
 from .transfer import Transfer
-from .workers import default_threads
+from .workers import default_threads, workers
 
 BLOCK = 1 << 16         # points accumulated at a time, so that memory does not grow with the mesh
 FIRST_RAYS = 32         # of an adaptive point; it has twice that before it may stop
@@ -45,7 +45,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     estimator = BlockedEstimator(mesh, scene, order, seed, most)
     probes = 0
     error: float | None = 0.0
-    with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+    with workers(threads, len(lit) * (rays or 2 * FIRST_RAYS)) as pool:
         scale = pilot.scale if pilot is not None and tolerance is not None else None
         if scale is None and tolerance is not None and len(lit):
             scale, probes = yield from _pilot(estimator, lit, order, pool, threads)
@@ -65,7 +65,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
         seconds=time.perf_counter() - began, error_estimate=error, tolerance=tolerance))
 
 
-def _pilot(estimator: BlockedEstimator, lit: NDArray, order: int, pool: ThreadPoolExecutor, threads: int
+def _pilot(estimator: BlockedEstimator, lit: NDArray, order: int, pool: Executor, threads: int
            ) -> Generator[float, None, tuple[float, int]]:
     """RMS of |T| over the mesh from a sample of points: what a relative tolerance is relative to."""
     sample = lit[::max(1, len(lit) // SCALE_POINTS)]
@@ -77,7 +77,7 @@ def _pilot(estimator: BlockedEstimator, lit: NDArray, order: int, pool: ThreadPo
 
 
 def _trace_block(estimator: BlockedEstimator, block: NDArray, order: int, rays: int | None,
-                 variance: float | None, pool: ThreadPoolExecutor, threads: int
+                 variance: float | None, pool: Executor, threads: int
                  ) -> Generator[float, None, tuple[NDArray, NDArray]]:
     """Transfer (n, K) of a block of points and the rays each took (n,).
 
@@ -142,7 +142,7 @@ def _to_continue(squared_error: NDArray, taken: NDArray, variance: float) -> NDA
 
 
 def _measured_error(mesh: TriangleMesh, scene: Occluders, order: int, seed: int, coefficients: NDArray,
-                    rays_of_point: NDArray, lit: NDArray, pool: ThreadPoolExecutor, threads: int
+                    rays_of_point: NDArray, lit: NDArray, pool: Executor, threads: int
                     ) -> Generator[float, None, tuple[float | None, int]]:
     """Relative L2 error of the bake, from a second, independent bake of a sample of its points.
 

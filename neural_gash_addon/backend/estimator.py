@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Generator, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from functools import lru_cache
 
 import numpy as np
@@ -80,7 +80,7 @@ class BlockedEstimator:
         out._excess = {}
         return out
 
-    def trace(self, pool: ThreadPoolExecutor, threads: int, points: NDArray, start: int, stop: int,
+    def trace(self, pool: Executor, threads: int, points: NDArray, start: int, stop: int,
               sums: NDArray[np.float64]) -> Generator[float, None, None]:
         """Add directions start..stop of each point to its sum.
 
@@ -187,7 +187,7 @@ class BlockedEstimator:
         share = mean[:, :1] / sh.normalisation(0, 0)  # Y_0 is constant, so this counts the blocked rays
         return mean + share * self._excess[start, stop][self._set_of_point[points]]
 
-    def transfer(self, pool: ThreadPoolExecutor, points: NDArray, local: NDArray) -> NDArray[np.float64]:
+    def transfer(self, pool: Executor, points: NDArray, local: NDArray) -> NDArray[np.float64]:
         """Transfer (n, K) in the bake frame: the exact unshadowed part minus the blocked part (n, K), local."""
         out = np.empty(local.shape)
 
@@ -199,7 +199,7 @@ class BlockedEstimator:
         list(pool.map(part, range(0, len(points), _TURNED_AT_ONCE)))
         return out
 
-    def blocked(self, pool: ThreadPoolExecutor, points: NDArray, sums: NDArray, stop: int) -> NDArray[np.float32]:
+    def blocked(self, pool: Executor, points: NDArray, sums: NDArray, stop: int) -> NDArray[np.float32]:
         """The blocked part (n, K) in the bake frame, from sums over directions 0..stop."""
         out = np.empty(sums.shape, np.float32)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Generator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from .raycast import Geometry
 from .record import BakeRecord
 from .transfer import Transfer
 from .voxels import Pyramid
-from .workers import default_threads, results
+from .workers import default_threads, results, workers
 
 _BUILDING = 0.2  # of the progress: pooling the surface
 
@@ -44,7 +43,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
 
     rounds = max(1, -(-len(lit) // (threads * gnn.CHUNK)))
     jobs = ((rows,) for rows in np.array_split(lit, threads * rounds) if len(rows))  # the threads end together
-    with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+    with workers(threads) as pool:
         asking = results(pool, threads, jobs, work)
         try:
             for rows, found in asking:

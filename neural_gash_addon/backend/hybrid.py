@@ -17,7 +17,7 @@ The network is a perceptron with one hidden layer for each pass; it runs in NumP
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,7 +89,7 @@ def _turned(axes: NDArray, rows: NDArray) -> NDArray[np.float64]:
 
 
 def filtered(places: NDArray, normals: NDArray, orders: Sequence[NDArray | None], blocked: NDArray[np.float32],
-             unshadowed: NDArray[np.float32], rays: int, network: Network, pool: ThreadPoolExecutor
+             unshadowed: NDArray[np.float32], rays: int, network: Network, pool: Executor
              ) -> NDArray[np.float32]:
     """The blocked part of all points after all passes.
 
@@ -150,7 +150,7 @@ def filtered(places: NDArray, normals: NDArray, orders: Sequence[NDArray | None]
     return found.T
 
 
-def between(some: NDArray[np.float32], unshadowed: NDArray[np.float32], pool: ThreadPoolExecutor
+def between(some: NDArray[np.float32], unshadowed: NDArray[np.float32], pool: Executor
             ) -> NDArray[np.float32]:
     """The blocked part of all points (n, K) along a curve, from that of the first, the third and so on.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Generator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from .raycast import Geometry, Occluders
 from .record import BakeRecord
 from .transfer import Transfer
 from .weights import load_hybrid
-from .workers import default_threads
+from .workers import default_threads, workers
 
 FIRST_RAYS = 4        # of a bake to a tolerance, where nothing is known beforehand
 _LADDER = sorted([2 ** k for k in range(2, 13)] + [3 * 2 ** k for k in range(1, 11)])  # rays of one to a tolerance
@@ -33,6 +33,7 @@ _DEAR = 32            # with so many
 # so many. (Tuned on meshes/train: of its four of 500 to 650 points two had a larger error with the network than Embree
 # in the same time, of larger ones none.)
 FEWEST, MOST_DOUBLED = 20 * SIZE, 64
+_PASSES = 4           # what the network costs at each point, in rays
 _ROWS = 1 << 14       # whose unshadowed transfer one worker computes at a time
 _SAMPLE = 128         # points at which the error is measured, or a 256th of them if that is more
 _MOST_SAMPLE = 2048
@@ -68,7 +69,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
         stop = FIRST_RAYS if pilot is None else expected_rays(pilot, tolerance)
         if pilot is not None and stop >= _DEAR:
             stop = expected_rays(pilot, _DARE * tolerance)
-    with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+    with workers(threads, len(lit) * (stop + _PASSES)) as pool:
         work = _Work(mesh, scene, order, seed, last, lit, pool, threads, network, asked)
         lit, left = work.lit, 1.0
         sample = None
@@ -109,8 +110,8 @@ def at_once(mesh: TriangleMesh, occluders: Sequence[Geometry], order: int, rays:
     scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
     coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
     threads = default_threads()
-    with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
-        lit = mesh.lit()
+    lit = mesh.lit()
+    with workers(threads, len(lit) * (rays + _PASSES)) as pool:
         if len(lit):
             work = _Work(mesh, scene, order, seed, rays, lit, pool, threads, load_hybrid())
             coefficients[work.lit] = work.unshadowed - run(work.trace(0, rays))[1]
@@ -121,7 +122,7 @@ class _Work:
     """The arrays of one bake, of the n points that have a normal, along the first curve."""
 
     def __init__(self, mesh: TriangleMesh, scene: Occluders, order: int, seed: int, rays: int, lit: NDArray,
-                 pool: ThreadPoolExecutor, threads: int, network: Network | None, tolerance: float | None = None
+                 pool: Executor, threads: int, network: Network | None, tolerance: float | None = None
                  ) -> None:
         self._mesh, self._order, self._seed = mesh, order, seed
         self._pool, self._threads, self._network = pool, threads, network

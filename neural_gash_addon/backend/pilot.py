@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Generator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -82,7 +82,7 @@ class Pilot:
         return float(np.clip(self.rays * (self.noise / tolerance) ** (2 / RATE), 1, MAX_RAYS))
 
 
-def look(mesh: TriangleMesh, scene: Occluders, order: int, tolerance: float, seed: int, pool: ThreadPoolExecutor,
+def look(mesh: TriangleMesh, scene: Occluders, order: int, tolerance: float, seed: int, pool: Executor,
          threads: int) -> Generator[float, None, Pilot]:
     """Trace a few points twice, with rays whose noise is about the tolerance. Yields progress."""
     lit = mesh.lit()
@@ -98,7 +98,7 @@ def look(mesh: TriangleMesh, scene: Occluders, order: int, tolerance: float, see
     return _said((points, one, two), unshadowed, rays, ray, 2 * rays * wanted)
 
 
-def twice(few: TriangleMesh, scene: Occluders, order: int, rays: int, seed: int, pool: ThreadPoolExecutor, threads: int
+def twice(few: TriangleMesh, scene: Occluders, order: int, rays: int, seed: int, pool: Executor, threads: int
           ) -> Generator[float, None, tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """The blocked part (n, K) of the points of a mesh, twice, with independent rays. Yields progress."""
     rows = np.tile(np.arange(len(few.points)), 2)  # at once: what a trace costs at all is much, where points are few
@@ -135,6 +135,11 @@ def _part(energies: NDArray, of: NDArray) -> tuple[float, float]:
 def sample_size(points: int) -> int:
     """How many of some points speak for all."""
     return min(max(_FEWEST, min(POINTS, points // 16), min(_MOST, points // 256)), points)
+
+
+def looking(points: int, tolerance: float) -> int:
+    """Rays of a look at some of so many points."""
+    return 2 * sample_size(points) * pilot_rays(tolerance)
 
 
 def pilot_rays(tolerance: float) -> int:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Generator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,7 +27,7 @@ from .raycast import Geometry, Occluders
 from .record import BakeRecord
 from .scene_points import CANDIDATES, TURN, farthest
 from .transfer import Transfer
-from .workers import default_threads
+from .workers import default_threads, workers
 
 POINTS, RAYS = 4096, 64        # scene points at least, and rays from each: noisy at one, and not over a neighbourhood
 MOST, ASKING = 16_384, 4       # and at most: one for so many points that ask, so that they are not most of the work
@@ -103,7 +102,7 @@ def traced(points: TriangleMesh, occluders: Occluders, order: int, rays: int, se
     rows = morton_order(points.points)
     estimator = BlockedEstimator(points, occluders, order, seed, rays)
     sums, out = np.zeros((len(rows), order * order)), np.zeros((len(rows), order * order))
-    with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+    with workers(threads, len(rows) * rays) as pool:
         yield from estimator.trace(pool, threads, rows, 0, rays, sums)
         out[rows] = estimator.blocked(pool, rows, sums, rays)
     return out

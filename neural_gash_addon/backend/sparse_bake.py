@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Generator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
@@ -28,7 +28,7 @@ from .progress import scaled
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
 from .transfer import Transfer
-from .workers import default_threads
+from .workers import default_threads, workers
 
 WINDOW = 8             # samples along the curve that a point is read off
 FIRST_STRIDE = 64      # points from one sample to the next at the beginning, or fewer where points are few
@@ -64,7 +64,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     spent = 0
     if len(lit) >= _LEAST_STRIDE * FEWEST:
         lit = lit[curve(mesh.points[lit], mesh.normals[lit])]
-        with ThreadPoolExecutor(threads, thread_name_prefix="neural_gash") as pool:
+        with workers(threads) as pool:
             work = _Work(mesh, scene, order, seed, lit, pool, threads)
             error = yield from scaled(work.refine(rays, tolerance, pilot), 0, 0.8)
             traced = len(work.samples) * work.rays
@@ -119,7 +119,7 @@ class _Work:
     """The samples of one bake; points are counted along the curve."""
 
     def __init__(self, mesh: TriangleMesh, scene: Occluders, order: int, seed: int, lit: NDArray,
-                 pool: ThreadPoolExecutor, threads: int) -> None:
+                 pool: Executor, threads: int) -> None:
         self._scene, self._order, self._pool, self._threads = scene, order, pool, threads
         self._mesh = replace(mesh, points=mesh.points[lit], normals=mesh.normals[lit], clearance=mesh.clearance[lit])
         self._lit = lit

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from queue import SimpleQueue
 from typing import TypeVar
 
@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 Result = TypeVar("Result")
 
 BLAS_SERIAL = 1 << 18  # multiply-adds up to which OpenBLAS stays on the calling thread
+# Rays, times threads, up to which there are none: waking them takes 50 µs and more each time, and on two threads of one
+# core nothing is gained by them in 20 ms. Many cores are awaited less long.
+_FEW_RAYS = 1 << 17
 
 
 def default_threads() -> int:
@@ -22,7 +25,27 @@ def default_threads() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def results(pool: ThreadPoolExecutor, threads: int, jobs: Iterable[tuple], work: Callable[..., Result]
+class _Here(Executor):
+    """Does everything at once, on the thread that asks for it."""
+
+    def submit(self, fn: Callable[..., Result], /, *arguments: object, **named: object) -> Future[Result]:
+        """The future of a call that is over."""
+        future: Future[Result] = Future()
+        try:
+            future.set_result(fn(*arguments, **named))
+        except Exception as error:  # noqa: BLE001  raised where it is awaited, as of any executor
+            future.set_exception(error)
+        return future
+
+
+def workers(threads: int, rays: float = float("inf")) -> Executor:
+    """Threads for so many rays, or what takes as long; the calling one where few would only wait for each other."""
+    if threads == 1 or rays * threads <= _FEW_RAYS:
+        return _Here()
+    return ThreadPoolExecutor(threads, thread_name_prefix="neural_gash")
+
+
+def results(pool: Executor, threads: int, jobs: Iterable[tuple], work: Callable[..., Result]
             ) -> Generator[Result, None, None]:
     """`work(*job)` of each job, in the order in which they end; two jobs wait for each of the threads.
 
