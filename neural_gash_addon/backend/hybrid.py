@@ -83,6 +83,13 @@ def second_curve(places: NDArray) -> NDArray[np.int64]:
     return morton_order(_turned(_TURN.T, places.T))
 
 
+def evenness(normals: NDArray) -> float:
+    """How alike the normals (N >= SIZE, 3) of a block of the curve along which they lie face: 0 (all ways) to 1."""
+    whole = len(normals) - len(normals) % SIZE
+    means = np.einsum("bnx->bx", normals[:whole].reshape(-1, SIZE, 3)) / SIZE
+    return float(np.square(means).sum(1).mean())
+
+
 def _turned(axes: NDArray, rows: NDArray) -> NDArray[np.float64]:
     """(axes (3, 3) @ rows (3, N)).T, not by BLAS: its threads would spin for a while on cores that trace rays."""
     return np.einsum("xy,yn->xn", axes, rows).T

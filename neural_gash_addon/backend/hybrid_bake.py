@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from . import spherical_harmonics as sh
 from .estimator import MAX_RAYS, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
-from .hybrid import SIZE, Network, between, filtered, placed, second_curve
+from .hybrid import SIZE, Network, between, evenness, filtered, placed, second_curve
 from .pilot import Pilot, pilot_rays, sample_size
 from .progress import run, scaled
 from .raycast import Geometry, Occluders
@@ -33,6 +33,10 @@ _DEAR = 32            # with so many
 # so many. (Tuned on meshes/train: of its four of 500 to 650 points two had a larger error with the network than Embree
 # in the same time, of larger ones none.)
 FEWEST, MOST_DOUBLED = 20 * SIZE, 64
+# As many where the normals of a block face all ways, as those of leaves and wires do: neighbours tell nothing there.
+# (Length of their mean, squared, in the mean of the blocks; of 49 meshes of meshes/train two have less, and only these
+# had a larger error with the network than Embree in the same time, estimated.)
+_LEAST_EVEN = 0.1
 _PASSES = 4           # what the network costs at each point, in rays
 _ROWS = 1 << 14       # whose unshadowed transfer one worker computes at a time
 _SAMPLE = 128         # points at which the error is measured, or a 256th of them if that is more
@@ -49,8 +53,8 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     """Trace `mesh` against itself and `occluders`, and take from neighbours; arguments as `methods.bake`.
 
     With a tolerance there are more rays until the measured error is within it, or they are MAX_RAYS. Of fewer than
-    FEWEST points up to twice the rays are traced, and the network is not asked. Of more, one ray from each point is two
-    from every other one.
+    FEWEST points, and of leaves and wires, up to twice the rays are traced, and the network is not asked. Of others,
+    one ray from each point is two from every other one.
 
     pilot: what is known beforehand; its points are those at which the error is measured.
     """
@@ -60,18 +64,19 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
         scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
     lit = mesh.lit()
     network = load_hybrid() if len(lit) >= FEWEST else None
-    last = MAX_RAYS if rays is None else rays if network else max(rays, min(2 * rays, MOST_DOUBLED))
     coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
     error: float | None = 0.0
-    used, probes, stop = 0, 0, last
+    used, probes, stop = 0, 0, rays or 0
     if tolerance is not None:
         tolerance *= _MARGIN
         stop = FIRST_RAYS if pilot is None else expected_rays(pilot, tolerance)
         if pilot is not None and stop >= _DEAR:
             stop = expected_rays(pilot, _DARE * tolerance)
     with workers(threads, len(lit) * (stop + _PASSES)) as pool:
-        work = _Work(mesh, scene, order, seed, last, lit, pool, threads, network, asked)
-        lit, left = work.lit, 1.0
+        work = _Work(mesh, scene, order, seed, rays or MAX_RAYS, lit, pool, threads, network, asked, _LEAST_EVEN)
+        lit, left, last = work.lit, 1.0, work.rays
+        if tolerance is None:
+            stop = last
         sample = None
         if len(lit):  # beside the rest, which waits for rays
             sample = pool.submit(work.sample) if pilot is None else pool.submit(work.along, *pilot.sample)
@@ -122,10 +127,11 @@ class _Work:
     """The arrays of one bake, of the n points that have a normal, along the first curve."""
 
     def __init__(self, mesh: TriangleMesh, scene: Occluders, order: int, seed: int, rays: int, lit: NDArray,
-                 pool: Executor, threads: int, network: Network | None, tolerance: float | None = None
-                 ) -> None:
+                 pool: Executor, threads: int, network: Network | None, tolerance: float | None = None,
+                 least_even: float = 0.0) -> None:
+        """rays: the most; twice as many where the network is not asked. least_even: of normals in blocks, for it."""
         self._mesh, self._order, self._seed = mesh, order, seed
-        self._pool, self._threads, self._network = pool, threads, network
+        self._pool, self._threads = pool, threads
         count = len(lit)
         self.lit = lit  # (n,) which points they are
         if network is None:
@@ -133,13 +139,17 @@ class _Work:
         else:
             places, normals = placed(mesh.points[lit], mesh.normals[lit])
             first = morton_order(places)
-            self.lit = lit[first]
+            self.lit, normals = lit[first], normals[first]
+            if evenness(normals) < least_even:
+                network = None
 
             def walked() -> tuple[NDArray, NDArray, tuple[None, NDArray]]:
                 here = places[first]
-                return here, normals[first], (None, second_curve(here))
+                return here, normals, (None, second_curve(here))
 
             self._placed = pool.submit(walked)  # beside the rest, which waits for rays
+        self._network = network
+        rays = self.rays = rays if network else max(rays, min(2 * rays, MOST_DOUBLED))
         self.unshadowed = np.empty((count, sh.coefficient_count(order)), np.float32)  # (n, K), `filled`
 
         def fill(start: int) -> None:

@@ -276,6 +276,41 @@ def test_of_few_points_more_rays_are_traced_and_no_network_is_asked(monkeypatch,
     np.testing.assert_allclose(found.coefficients, bake(mesh, "embree", traced).coefficients, atol=1e-6)
 
 
+def wires(count=40):
+    """Thin prisms in all directions, about each other."""
+    rng, parts = np.random.default_rng(0), []
+    for number in range(count):
+        one = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        turn = np.arange(6) * np.pi / 3
+        ring = np.stack([0.01 * np.cos(turn), 0.01 * np.sin(turn), np.zeros(6)], 1)
+        rings = np.concatenate([(ring + [0, 0, z]) @ one.T for z in (-1, -0.3, 0.3, 1)]) + rng.normal(size=3) * 0.2
+        k, i = (g.ravel() for g in np.meshgrid(np.arange(3), np.arange(6), indexing="ij"))
+        a, b, c, d = 6 * k + i, 6 * k + (i + 1) % 6, 6 * k + 6 + (i + 1) % 6, 6 * k + 6 + i
+        parts.append((rings, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]) + 24 * number))
+    return TriangleMesh.from_triangles(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+
+def test_evenness_is_that_of_the_normals_of_blocks():
+    normals = np.repeat(np.eye(3), hybrid.SIZE, 0)
+    assert hybrid.evenness(normals) == pytest.approx(1)
+    assert hybrid.evenness(np.tile(np.eye(3), (hybrid.SIZE, 1))) == pytest.approx(1 / 3, abs=0.01)
+    normals[1::2] *= -1
+    assert hybrid.evenness(normals) == 0
+
+
+def test_of_wires_more_rays_are_traced_and_no_network_is_asked(monkeypatch):
+    """A larger error than plain rays in the same time is what the network would have."""
+    mesh = wires()
+    monkeypatch.setattr(hybrid_bake, "filtered", refuse)
+    assert len(mesh.points) >= hybrid_bake.FEWEST
+    found = bake(mesh, rays=4)
+    assert found.record.rays == 8 * len(mesh.points)
+    np.testing.assert_allclose(found.coefficients, bake(mesh, "embree", 8).coefficients, atol=1e-6)
+    assert bake(mesh, rays=None, tolerance=0.2).record.error_estimate <= 0.2
+    with pytest.raises(AssertionError, match="asked"):  # frames that come one after another keep to their rays
+        hybrid_bake.at_once(mesh, [], 3, 2, 0)
+
+
 def test_of_more_points_the_network_is_asked(monkeypatch):
     monkeypatch.setattr(hybrid_bake, "filtered", refuse)
     with pytest.raises(AssertionError, match="asked"):
