@@ -17,7 +17,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 from meshes import FOLDER, read
-from scipy.stats import theilslopes
 from table import Table, processor_seconds, seconds
 
 from neural_gash_addon.backend import methods, metrics
@@ -36,8 +35,8 @@ def curve(mesh: TriangleMesh, reference: np.ndarray, ladder: tuple[int, ...],
           timed: Callable[[Callable[[], object]], float] = seconds) -> dict[str, list[tuple[float, float]]]:
     """(seconds, SRR) of both methods at each number of rays, measured in turns.
 
-    Seconds are those of a line in the number of rays, fitted to the least of REPEATS or more at each (Theil and Sen):
-    a bake costs so much, and so much a ray; the rest is the machine's. SRR is the median over seeds.
+    Seconds are the least of REPEATS or more at each, and no more than with more rays: the rest is the machine's. (Not
+    of a line in the number of rays, as few are traced on one thread.) SRR is the median over seeds.
     """
     unshadowed = sh.cosine_lobe(mesh.normals, ORDER)
     found: dict[str, list[tuple[float, float]]] = {"embree": [], "hybrid": []}
@@ -55,8 +54,8 @@ def curve(mesh: TriangleMesh, reference: np.ndarray, ladder: tuple[int, ...],
         for name, measured in runs.items():
             found[name].append((min(t for t, _ in measured), statistics.median(s for _, s in measured)))
     for name, points in found.items():
-        slope, base, _, _ = theilslopes([t for t, _ in points], ladder)
-        found[name] = [(base + max(slope, 1e-9) * rays, s) for rays, (_, s) in zip(ladder, points, strict=True)]
+        least = np.minimum.accumulate([t for t, _ in points[::-1]])[::-1]
+        found[name] = [(float(t), s) for t, (_, s) in zip(least, points, strict=True)]
     return found
 
 
