@@ -25,13 +25,16 @@ KEPT = 0.7              # squared error left after a doubling, as a part of the 
 POOL = 9                # neighbours along the Z-order curve whose error estimates are averaged
 SCALE_POINTS = 1024     # that say what a tolerance is relative to
 REPLICATES = 1024       # points baked twice to measure the error; a 16th of them, if that is less, or a 32nd, if more
-_FEWEST, _MOST = 256, 8192
+FEWEST, _MOST = 256, 8192
 
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None,
          occluders: Sequence[Geometry], seed: int, threads: int | None, scene: Occluders | None = None,
-         pilot: Pilot | None = None) -> Generator[float, None, Transfer]:
-    """Trace `mesh` against itself and `occluders`; arguments as `methods.bake`. pilot: what is known beforehand."""
+         pilot: Pilot | None = None, fewest: int = FEWEST) -> Generator[float, None, Transfer]:
+    """Trace `mesh` against itself and `occluders`; arguments as `methods.bake`.
+
+    pilot: what is known beforehand. fewest: points baked twice, at least.
+    """
     began = time.perf_counter()
     threads = threads or default_threads()
     if scene is None:
@@ -56,7 +59,8 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
                                 else (tolerance * scale) ** 2, pool, threads)
             coefficients[block], rays_of_point[block] = yield from scaled(work, 0.95 * done, 0.95 * share)
         if len(lit):
-            work_error = _measured_error(mesh, scene, order, seed, coefficients, rays_of_point, lit, pool, threads)
+            work_error = _measured_error(mesh, scene, order, seed, coefficients, rays_of_point, lit, fewest, pool,
+                                         threads)
             error, extra = yield from scaled(work_error, 0.95, 0.05)
             probes += extra
     return Transfer(coefficients, BakeRecord(
@@ -142,14 +146,14 @@ def _to_continue(squared_error: NDArray, taken: NDArray, variance: float) -> NDA
 
 
 def _measured_error(mesh: TriangleMesh, scene: Occluders, order: int, seed: int, coefficients: NDArray,
-                    rays_of_point: NDArray, lit: NDArray, pool: Executor, threads: int
+                    rays_of_point: NDArray, lit: NDArray, fewest: int, pool: Executor, threads: int
                     ) -> Generator[float, None, tuple[float | None, int]]:
     """Relative L2 error of the bake, from a second, independent bake of a sample of its points.
 
     Two independent estimates with the same rays differ by sqrt(2) standard errors; nothing is
     assumed of how fast the error falls.
     """
-    size = min(len(lit), max(_FEWEST, min(REPLICATES, len(lit) // 16), min(_MOST, len(lit) // 32)))
+    size = min(len(lit), max(fewest, min(REPLICATES, len(lit) // 16), min(_MOST, len(lit) // 32)))
     rng = np.random.default_rng([seed, 1])
     sample = lit[np.sort(rng.choice(len(lit), size, replace=False))]
     taken = rays_of_point[sample]

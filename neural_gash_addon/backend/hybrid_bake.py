@@ -5,14 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Generator, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from . import embree_bake
 from . import spherical_harmonics as sh
 from .estimator import MAX_RAYS, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
-from .hybrid import SIZE, Network, between, evenness, filtered, placed, second_curve
+from .hybrid import SIZE, between, evenness, filtered, placed, second_curve
 from .pilot import Pilot, pilot_rays, sample_size
 from .progress import run, scaled
 from .raycast import Geometry, Occluders
@@ -62,32 +64,35 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     threads = threads or default_threads()
     if scene is None:
         scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
-    lit = mesh.lit()
-    network = load_hybrid() if len(lit) >= FEWEST else None
-    coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
-    error: float | None = 0.0
-    used, probes, stop = 0, 0, rays or 0
     if tolerance is not None:
         tolerance *= _MARGIN
+    lit = mesh.lit()
+    curve = _Curve(mesh, lit) if len(lit) >= FEWEST else None
+    if curve is None or evenness(curve.normals) < _LEAST_EVEN:
+        more = None if rays is None else max(rays, min(2 * rays, MOST_DOUBLED))
+        found = yield from embree_bake.bake(mesh, order, rays=more, tolerance=tolerance, occluders=occluders, seed=seed,
+                                            threads=threads, scene=scene, pilot=pilot, fewest=_SAMPLE)
+        return Transfer(found.coefficients, replace(found.record, method="hybrid", tolerance=asked,
+                                                    seconds=time.perf_counter() - began))
+    coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
+    last = stop = rays or MAX_RAYS
+    used, probes, left = 0, 0, 1.0
+    if tolerance is not None:
         stop = FIRST_RAYS if pilot is None else expected_rays(pilot, tolerance)
         if pilot is not None and stop >= _DEAR:
             stop = expected_rays(pilot, _DARE * tolerance)
     with workers(threads, len(lit) * (stop + _PASSES)) as pool:
-        work = _Work(mesh, scene, order, seed, rays or MAX_RAYS, lit, pool, threads, network, asked, _LEAST_EVEN)
-        lit, left, last = work.lit, 1.0, work.rays
-        if tolerance is None:
-            stop = last
-        sample = None
-        if len(lit):  # beside the rest, which waits for rays
-            sample = pool.submit(work.sample) if pilot is None else pool.submit(work.along, *pilot.sample)
-        while sample is not None:
+        work = _Work(mesh, scene, order, seed, last, curve, pool, threads, asked)
+        # beside the rest, which waits for rays
+        sample = pool.submit(work.sample) if pilot is None else pool.submit(work.along, *pilot.sample)
+        while True:
             share = left if tolerance is None else left / 2
             traced, taken = yield from scaled(work.trace(used, stop), 1 - left, share)
             used, left, probes = stop, left - share, work.probes if pilot is None else 0
             blocked, here = work.blended(traced, taken, *sample.result())
             error = work.error(here, *sample.result())
             if used == last or (error is not None and tolerance is not None and error <= tolerance):
-                coefficients[lit] = work.unshadowed - blocked
+                coefficients[work.lit] = work.unshadowed - blocked
                 break
             stop = _more(used, error, tolerance)
     return Transfer(coefficients, BakeRecord(
@@ -116,40 +121,34 @@ def at_once(mesh: TriangleMesh, occluders: Sequence[Geometry], order: int, rays:
     coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
     threads = default_threads()
     lit = mesh.lit()
-    with workers(threads, len(lit) * (rays + _PASSES)) as pool:
-        if len(lit):
-            work = _Work(mesh, scene, order, seed, rays, lit, pool, threads, load_hybrid())
+    if len(lit):
+        with workers(threads, len(lit) * (rays + _PASSES)) as pool:
+            work = _Work(mesh, scene, order, seed, rays, _Curve(mesh, lit), pool, threads)
             coefficients[work.lit] = work.unshadowed - run(work.trace(0, rays))[1]
     return coefficients
+
+
+class _Curve:
+    """The n points (at least one) that have a normal, along the first curve."""
+
+    def __init__(self, mesh: TriangleMesh, lit: NDArray) -> None:
+        places, normals = placed(mesh.points[lit], mesh.normals[lit])
+        order = morton_order(places)
+        self.lit = lit[order]          # (n,) which of the mesh's they are
+        self.places = places[order]    # (n, 3) as `filtered` wants them,
+        self.normals = normals[order]  # (n, 3) likewise
 
 
 class _Work:
     """The arrays of one bake, of the n points that have a normal, along the first curve."""
 
-    def __init__(self, mesh: TriangleMesh, scene: Occluders, order: int, seed: int, rays: int, lit: NDArray,
-                 pool: Executor, threads: int, network: Network | None, tolerance: float | None = None,
-                 least_even: float = 0.0) -> None:
-        """rays: the most; twice as many where the network is not asked. least_even: of normals in blocks, for it."""
-        self._mesh, self._order, self._seed = mesh, order, seed
-        self._pool, self._threads = pool, threads
-        count = len(lit)
-        self.lit = lit  # (n,) which points they are
-        if network is None:
-            self.lit = lit[morton_order(mesh.points[lit])] if count else lit
-        else:
-            places, normals = placed(mesh.points[lit], mesh.normals[lit])
-            first = morton_order(places)
-            self.lit, normals = lit[first], normals[first]
-            if evenness(normals) < least_even:
-                network = None
-
-            def walked() -> tuple[NDArray, NDArray, tuple[None, NDArray]]:
-                here = places[first]
-                return here, normals, (None, second_curve(here))
-
-            self._placed = pool.submit(walked)  # beside the rest, which waits for rays
-        self._network = network
-        rays = self.rays = rays if network else max(rays, min(2 * rays, MOST_DOUBLED))
+    def __init__(self, mesh: TriangleMesh, scene: Occluders, order: int, seed: int, rays: int, curve: _Curve,
+                 pool: Executor, threads: int, tolerance: float | None = None) -> None:
+        """rays: the most."""
+        self._mesh, self._order, self._seed, self._curve = mesh, order, seed, curve
+        self._pool, self._threads, self._network = pool, threads, load_hybrid()
+        self.lit, count = curve.lit, len(curve.lit)
+        self._second = pool.submit(second_curve, curve.places)  # beside the rest, which waits for rays
         self.unshadowed = np.empty((count, sh.coefficient_count(order)), np.float32)  # (n, K), `filled`
 
         def fill(start: int) -> None:
@@ -158,10 +157,8 @@ class _Work:
 
         self._filled = pool.map(fill, range(0, count, _ROWS))
         self._sums = np.zeros(self.unshadowed.shape)
-        # without the network, as much as a bake by rays alone traces anew to measure its error, or less
-        most = count if network else -(-count // 2)
         times = float(np.clip(2 * count / _TWICE_FROM, 1, 2))
-        self._sample_size = min(most, max(_SAMPLE, min(count // 256, _MOST_SAMPLE)))
+        self._sample_size = min(count, max(_SAMPLE, min(count // 256, _MOST_SAMPLE)))
         self._sample_rays = int(np.clip(round(times * rays), _LEAST_SAMPLE_RAYS, _MOST_SAMPLE_RAYS))
         if tolerance is not None:
             self._sample_size, self._sample_rays = sample_size(count), pilot_rays(tolerance)
@@ -175,9 +172,9 @@ class _Work:
         Where `stop` is 1, two rays are traced from every other point along the curve.
 
         Returns:
-            (n, K) as it was traced, and as the network has it, if there is one.
+            (n, K) as it was traced, and as the network has it.
         """
-        half = self._network is not None and stop == 1  # one ray says nothing of where it came from, two do
+        half = stop == 1  # one ray says nothing of where it came from, two do
         if half:
             stop = 2
         lit, sums = (self.lit[::2], self._sums[::2]) if half else (self.lit, self._sums)
@@ -186,9 +183,8 @@ class _Work:
         traced = self._estimator.blocked(self._pool, lit, sums, stop)
         if half:
             traced = between(traced, self.unshadowed, self._pool)
-        if self._network is None:
-            return traced, traced
-        return traced, filtered(*self._placed.result(), traced, self.unshadowed, stop, self._network, self._pool)
+        return traced, filtered(self._curve.places, self._curve.normals, (None, self._second.result()), traced,
+                                self.unshadowed, stop, self._network, self._pool)
 
     def sample(self) -> tuple[NDArray, NDArray, NDArray]:
         """Some of the points (s,), and two independent traces (s, K) of their blocked part; on the calling thread."""
