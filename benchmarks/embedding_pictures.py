@@ -83,7 +83,7 @@ def main() -> None:
             points, direct = methods.run(lit_points(scene, occluders, threads=1)), traced(STRAIGHT, 4, depth=1)
             every = np.concatenate([points.places, points.normals, points.albedo], 1)
             sample = judging.Sample(every, points.direct, points.indirect[None], seen.queries, None, None, None,
-                                    embedding.layout(points.places, 32, 16), None, None)
+                                    embedding.layout(points.places, (2, 2), 32, 16), None, None)
             return {name: direct + give(sample, np.arange(len(places))) for name, give in judging.BASELINES.items()}
 
         truth = traced(arguments.reference, 1)

@@ -54,7 +54,7 @@ class Sample:
         with np.load(path) as found:
             places, normals, blocked, bounced, queries, query_normals, self.truth = (found[key] for key in ARRAYS)
         settings: Settings = trained().settings
-        layout = embedding.layout(places, settings.gathered, settings.around)
+        layout = embedding.layout(places, settings.halvings, settings.gathered, settings.around)
         parents = nearest_to(places, places[:len(layout.around)], 1)[:, 0]
         self.points, self.facing, self.bounced = places, normals, bounced
         self.frame = Frame.of(_tensor(places), _tensor(normals), layout)

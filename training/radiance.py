@@ -28,7 +28,6 @@ from .room_labels import VALIDATION_RAYS
 
 NAME = "radiance"
 STEPS, RATE, EVERY = 1_800, 2e-3, 100
-FURTHER_STEPS, FURTHER_RATE = 150, 1e-3  # from the weights that ship, after the embedding has been trained further
 BANDS = range(1, ORDER)
 ROUGHNESS = 0.4, 0.6
 PATHS = 64  # as many as a scene point has
@@ -165,16 +164,10 @@ def table(model: nn.Module, held: list[Room]) -> str:
     return "\n".join(lines)
 
 
-def train(kept: list[Path], held: list[Room], steps: int, seed: int, checkpoint: Path, log: Path, further: bool = False
-          ) -> Radiance:
-    """Train, and write log and checkpoint as we go; on from the checkpoint, where there is one of just this.
-
-    further: from the weights that ship instead of random ones.
-    """
+def train(kept: list[Path], held: list[Room], steps: int, seed: int, checkpoint: Path, log: Path) -> Radiance:
+    """Train, and write log and checkpoint as we go; on from the checkpoint, where there is one of just this."""
     torch.manual_seed(seed)
-    embedded = trained()
-    model = embedding_bake.radiance_network(embedded) if further else Radiance(embedded.settings)
-    model = model.to(loop.device())
+    model = Radiance(trained().settings).to(loop.device())
 
     def loss_of(model: nn.Module, rng: np.random.Generator) -> Tensor:
         drawn = room(kept[rng.integers(len(kept))])
@@ -191,15 +184,14 @@ def train(kept: list[Path], held: list[Room], steps: int, seed: int, checkpoint:
         return {"relative": float(np.mean(errors)),
                 **{f"band {band}": float(np.median([found[band] for found in bands])) for band in BANDS}}
 
-    return loop.run(model, loss_of, look, steps=steps, rate=FURTHER_RATE if further else RATE,
-                    every=min(EVERY, steps), seed=seed, checkpoint=checkpoint, log=log)
+    return loop.run(model, loss_of, look, steps=steps, rate=RATE, every=EVERY, seed=seed, checkpoint=checkpoint,
+                    log=log)
 
 
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", type=int, help="instead of the usual ones")
-    parser.add_argument("--further", action="store_true", help="from the weights that ship")
+    parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cache", type=Path, default=CACHE, help="of labelled rooms, from training.room_labels")
     parser.add_argument("--out", type=Path, default=weights.FOLDER, help="folder of the weights")
@@ -210,10 +202,8 @@ def main() -> None:
     if not kept or not held:
         parser.error(f"there are too few labelled rooms in '{arguments.cache}'; make them with "
                      "`python -m training.room_labels`")
-    name = f"{NAME}-further" if arguments.further else NAME
-    log = Path(__file__).parent / "logs" / f"{name}.csv"
-    steps = arguments.steps or (FURTHER_STEPS if arguments.further else STEPS)
-    model = train(kept, held, steps, arguments.seed, arguments.cache / f"{name}.checkpoint", log, arguments.further)
+    log = Path(__file__).parent / "logs" / f"{NAME}.csv"
+    model = train(kept, held, arguments.steps, arguments.seed, arguments.cache / f"{NAME}.checkpoint", log)
     arguments.out.mkdir(parents=True, exist_ok=True)
     weights.save(arguments.out / weights.RADIANCE,
                  {name: value.cpu().numpy() for name, value in model.state_dict().items()})

@@ -22,8 +22,8 @@ from neural_gash_addon.backend import embedding, sky_bake, weights
 from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.geometry import TriangleMesh
 from neural_gash_addon.backend.nearest import nearest_to
-from neural_gash_addon.backend.networks.embedding import SMALL, Frame, Settings
-from neural_gash_addon.backend.networks.sky import SkyEmbedding
+from neural_gash_addon.backend.networks.embedding import Frame, Settings
+from neural_gash_addon.backend.networks.sky import SKY, SkyEmbedding
 from neural_gash_addon.backend.progress import run
 from neural_gash_addon.backend.raycast import Occluders
 
@@ -56,7 +56,7 @@ class Sample:
 
 
 @cache
-def load(path: Path, settings: Settings = SMALL) -> Sample | None:
+def load(path: Path, settings: Settings = SKY) -> Sample | None:
     """A mesh of the cache, kept in memory; None where nothing of it can be asked."""
     found = labels.load(path)
     rows = np.flatnonzero(np.any(found.normals != 0, axis=1))
@@ -70,7 +70,7 @@ def load(path: Path, settings: Settings = SMALL) -> Sample | None:
         blocked = run(sky_bake.traced(surface, occluders, sh.MAX_ORDER, sky_bake.RAYS, seed, 1))
         points.append(sky_bake.ScenePoints(points[0].places, points[0].normals,
                                            sky_bake.split(blocked, surface.normals), sky_bake.RAYS))
-    layout = embedding.layout(points[0].places, settings.gathered, settings.around)
+    layout = embedding.layout(points[0].places, settings.halvings, settings.gathered, settings.around)
     places, normals = sky_bake.in_scale(found.positions[rows], occluders), found.normals[rows]
     near = nearest_to(places, points[0].places, settings.neighbours)
     parents = nearest_to(points[0].places, points[0].places[:len(layout.around)], 1)[:, 0]
@@ -144,7 +144,7 @@ def network(model: nn.Module) -> Callable[[Sample, NDArray], NDArray]:
 def train(kept: list[Sample], held: list[Sample], steps: int, seed: int, checkpoint: Path, log: Path) -> SkyEmbedding:
     """Train, and write log and checkpoint as we go; on from the checkpoint, where there is one of just this."""
     torch.manual_seed(seed)
-    model = SkyEmbedding(SMALL).to(loop.device())
+    model = SkyEmbedding(SKY).to(loop.device())
 
     def loss_of(model: nn.Module, rng: np.random.Generator) -> Tensor:
         sample = kept[rng.integers(len(kept))]
@@ -182,7 +182,7 @@ def main() -> None:
                  {name: value.cpu().numpy() for name, value in model.state_dict().items()})
     draw(log, ["srr_median", "srr_mean"])
     print(f"{len(kept)} meshes, {len(held)} held out; SRR: median, mean, worst")
-    untrained = SkyEmbedding(SMALL).to(loop.device()).eval()
+    untrained = SkyEmbedding(SKY).to(loop.device()).eval()
     means = {f"mean of the {count} nearest scene points": near_mean(count) for count in (4, 16, 64)}
     for name, give in {"network": network(model), "before training": network(untrained), **means}.items():
         found = judged(give, held)

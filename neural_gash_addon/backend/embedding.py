@@ -2,11 +2,13 @@
 """Who is near whom in a room: what the light-transport embedding (`networks.embedding`) reads beside the points.
 
 Xu et al. 2026, "A Generalizable Light Transport 3D Embedding for Global Illumination". A room is M scene points in
-farthest-point order, so its codes (section 3.3: M / 4) are the first of them: farthest point sampling takes at each
-step the point farthest from those it has; those that it takes of all M first are those that it would take at all.
+farthest-point order, so its codes (section 3.3: M / 4) are the first of them, and those between, halfway there, too:
+farthest point sampling takes at each step the point farthest from those it has; those that it takes of all M first are
+those that it would take at all.
 """
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +18,6 @@ from . import serialise
 from .nearest import nearest_to
 
 EXTENT = 20.0   # metres: the largest side of a room that was trained with, and a little more
-CODES = 4       # scene points to a code (section 3.3)
 _BESIDE = 6     # neighbours whose distance tells a point's area
 _AREA = 0.95    # of their mean squared distance; measured on 16 rooms of training.rooms: 0.93 of all, 1.0 of lamps
 
@@ -31,22 +32,30 @@ class Layout:
     """
 
     gathered: Indices           # (m, k) the points nearest to each code, itself first
+    halvings: tuple[Indices, ...]  # of each step from M points to m codes: (to, k) those before it nearest to each
     around: Indices             # (m, k) the codes nearest to each
     orders: Indices             # (serialise.CURVES, m) of the codes along each curve
     areas: NDArray[np.float32]  # (M,)
 
 
-def layout(positions: NDArray, gathered: int, around: int) -> Layout:
+def layout(positions: NDArray, steps: Sequence[int], gathered: int, around: int) -> Layout:
     """What an encoder reads.
 
     Args:
         positions: (M, 3) of scene points in farthest-point order, M >= 1; points may coincide. Metres.
-        gathered: points of each code. around: codes about each code. Fewer, where there are no more.
+        steps: of each, how many of the points before it are one after it; a code for as many points as their product.
+        gathered: points of each code, and of each point after a step. around: codes about each code. Fewer, where
+            there are no more.
     """
-    codes = positions[:-(-len(positions) // CODES)]
+    counts = [len(positions)]
+    for step in steps:
+        counts.append(-(-counts[-1] // step))
+    codes = positions[:counts[-1]]
     places = (np.asarray(codes, np.float64) - np.min(positions, axis=0)) / EXTENT
-    return Layout(nearest_to(codes, positions, gathered), nearest_to(codes, codes, around),
-                  serialise.orders(places), areas(positions))
+    halvings = tuple(nearest_to(positions[:after], positions[:before], gathered)
+                     for before, after in zip(counts, counts[1:], strict=False))
+    near = halvings[0] if len(steps) == 1 else nearest_to(codes, positions, gathered)
+    return Layout(near, halvings, nearest_to(codes, codes, around), serialise.orders(places), areas(positions))
 
 
 def areas(positions: NDArray) -> NDArray[np.float32]:

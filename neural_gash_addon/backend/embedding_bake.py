@@ -45,7 +45,7 @@ def network() -> Any:
     from .networks.embedding import FULL, SMALL, Embedding
 
     arrays = weights.load(weights.FOLDER / weights.EMBEDDING)
-    return weights.filled(Embedding(FULL if len(arrays["encoder.leave.weight"]) == FULL.width else SMALL), arrays)
+    return weights.filled(Embedding(FULL if len(arrays["encoder.transform.leave.weight"]) == FULL.widths[-1] else SMALL), arrays)
 
 
 def radiance_network(model: Any) -> Any:
@@ -180,7 +180,7 @@ class Room:
         self.radiance: Any = None if radiance is None else radiance.to(device)
         sizes = model.settings
         self._centre = np.mean(points.places, axis=0, dtype=np.float64)
-        self._layout = embedding.layout(points.places, sizes.gathered, sizes.around)
+        self._layout = embedding.layout(points.places, sizes.halvings, sizes.gathered, sizes.around)
         self._frame = Frame.of(self._tensor(points.places - self._centre), self._tensor(points.normals), self._layout)
         self._anchors = points.places[:len(self._layout.around)]
         albedo, direct, indirect = (self._tensor(each.T) for each in (points.albedo, points.direct, points.indirect))

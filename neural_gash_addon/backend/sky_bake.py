@@ -125,19 +125,18 @@ def in_scale(places: NDArray, occluders: Occluders) -> NDArray[np.float32]:
 def network() -> Any:
     """The trained network: networks.sky.SkyEmbedding, in `eval` mode. Raises UserError: no torch or weights."""
     import_torch("embedding")
-    from .networks.embedding import SMALL
-    from .networks.sky import SkyEmbedding
+    from .networks.sky import SKY, SkyEmbedding
 
-    return weights.filled(SkyEmbedding(SMALL), weights.load(weights.FOLDER / weights.SKY))
+    return weights.filled(SkyEmbedding(SKY), weights.load(weights.FOLDER / weights.SKY))
 
 
 def reflecting() -> Any:
     """The trained decoder of what bounces: networks.reflected.Reflected, in `eval` mode. Raises as `network`."""
     import_torch("embedding")
-    from .networks.embedding import SMALL
     from .networks.reflected import Reflected
+    from .networks.sky import SKY
 
-    return weights.filled(Reflected(SMALL), weights.load(weights.FOLDER / weights.BOUNCES))
+    return weights.filled(Reflected(SKY), weights.load(weights.FOLDER / weights.BOUNCES))
 
 
 class Sky:
@@ -152,7 +151,7 @@ class Sky:
         self.occluders, self._rays = occluders, points.rays * len(points.places)
         self._model, self._device = model.to(device), device
         sizes = model.settings
-        layout = embedding.layout(points.places, sizes.gathered, sizes.around)
+        layout = embedding.layout(points.places, sizes.halvings, sizes.gathered, sizes.around)
         self._places, self._surface = points.places, points.surface
         parents = nearest_to(points.places, points.places[:len(layout.around)], 1)[:, 0]
         self._frame = Frame.of(self._tensor(points.places), self._tensor(points.normals), layout)

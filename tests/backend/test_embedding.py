@@ -17,7 +17,8 @@ from neural_gash_addon.backend.lit_scene import LitScene  # noqa: E402
 from neural_gash_addon.backend.methods import run  # noqa: E402
 from neural_gash_addon.backend.networks import embedding as networks  # noqa: E402
 
-TINY = networks.Settings(width=32, blocks=3, hidden=16, gathered=6, around=4, patch=16, neighbours=5)
+TINY = networks.Settings(first=16, widths=(32, 32, 64), hidden=16, gathered=6, around=4, patch=16, neighbours=5, layers=3,
+                         dropout=0.1)
 POINTS = 150
 
 
@@ -74,11 +75,13 @@ def changed(points, **fields):
 
 def test_the_layout_is_of_nearest_points(room):
     points = room[0].places.astype(np.float64)
-    found = embedding.layout(points, 6, 4)
-    for rows, of in ((found.gathered, points), (found.around, points[:38])):
-        away = cKDTree(of).query(points[:38], rows.shape[1])[0]
-        np.testing.assert_allclose(np.linalg.norm(points[rows] - points[:38, None], axis=2), away, rtol=1e-6)
+    found = embedding.layout(points, (2, 2), 6, 4)
+    half, quarter = found.halvings
+    for rows, of in ((found.gathered, points), (half, points), (quarter, points[:75]), (found.around, points[:38])):
+        away = cKDTree(of).query(points[:len(rows)], rows.shape[1])[0]
+        np.testing.assert_allclose(np.linalg.norm(points[rows] - points[:len(rows), None], axis=2), away, rtol=1e-6)
     assert found.gathered.shape == (38, 6) and found.around.shape == (38, 4) and found.areas.shape == (POINTS,)
+    assert half.shape == (75, 6) and quarter.shape == (38, 6)
     assert (np.sort(found.orders, 1) == np.arange(38)).all() and len(found.orders) == serialise.CURVES
 
 
@@ -117,6 +120,43 @@ def test_surroundings_are_a_depthwise_convolution():
     np.testing.assert_allclose(layer(x, lie, around).detach(), layer.norm(layer.leave(expected)).detach(), atol=1e-5)
 
 
+def test_a_halving_is_the_greatest_of_what_points_about_a_point_are_beside_it(room):
+    """Equations 2 and 3 one neighbour at a time, the concatenation's matrix in its two parts."""
+    torch.manual_seed(0)
+    layer, frame = networks.Halving(6, 8), frame_of(room[0])
+    near, x = frame.halvings[1], torch.randn(2, 75, 6)
+    expected = torch.empty(2, 38, 8)
+    for b in range(2):
+        for row in range(38):
+            spacing = (frame.areas[row] * POINTS / 38).sqrt()
+            each = []
+            for k in near[row]:
+                way = (frame.places[k] - frame.places[row]) / spacing
+                lie = torch.stack([way @ frame.normals[row], way @ frame.normals[k], way.norm(), way.square().sum().log1p(),
+                                   frame.normals[k] @ frame.normals[row]])
+                each.append(layer.difference(x[b, k] - x[b, row]) + layer.centre(x[b, row]) + layer.offset(lie))
+            expected[b, row] = torch.nn.functional.gelu(layer.norm(torch.stack(each).amax(0)))
+    found = layer(x, near, frame.lie(near))
+    np.testing.assert_allclose(found.detach(), expected.detach(), rtol=1e-4, atol=1e-4)
+
+
+def test_a_code_gathers_from_points_about_points_about_it(room, model):
+    """Halving by halving: what a scene point carries reaches just the codes that have it in reach."""
+    frame = frame_of(room[0])
+    first, second = (each.numpy() for each in frame.halvings)
+    carried, beside = torch.rand(1, POINTS, 4), torch.zeros(1, 38, 3 * networks.POOLS)
+    before = model.encoder.embed(frame, carried, beside)
+    reached = np.zeros(38, bool)
+    for point in range(0, POINTS, 10):
+        other = carried.clone()
+        other[0, point] += 5
+        changed_codes = (model.encoder.embed(frame, other, beside) != before).any(2)[0].numpy()
+        can = np.isin(second, np.flatnonzero((first == point).any(1) | (np.arange(75) == point))).any(1)
+        assert not (changed_codes & ~can).any()
+        reached |= changed_codes & ~(frame.gathered.numpy() == point).any(1)
+    assert reached.any()  # from farther than the k nearest
+
+
 @pytest.mark.parametrize("count", [1, 15, 16, 17, 50, 64])
 def test_attention_is_among_the_codes_of_a_patch(count):
     """One patch at a time, one code at a time; patches as equal as they can be, none above 16."""
@@ -143,7 +183,7 @@ def test_attention_is_among_the_codes_of_a_patch(count):
 
 
 def test_the_decoder_is_vector_attention(room, model):
-    """Equations 8 to 10 one code at a time; beside it the mean of light by the first of the weights."""
+    """Equations 8 to 10 one code at a time, layer by layer; beside it the mean of light by the first of the weights."""
     decoder, rng = model.decoder, torch.Generator().manual_seed(0)
     frame = frame_of(room[0])
     codes = networks.Codes(*(torch.randn(2, 38, *size, generator=rng) for size in ((), (16,), (16,))))
@@ -164,6 +204,17 @@ def test_the_decoder_is_vector_attention(room, model):
                 values.append(codes.value[b, k] + offset)
                 light.append(codes.light[b, k])
             latent = kept + (torch.stack(scores).softmax(0) * torch.stack(values)).sum(0)
+            for layer in decoder.further:
+                asks, scores, values = layer.asks(layer.norms[0](latent)), [], []
+                for k in near[j]:
+                    lie = networks.relation(places[j:j + 1], normals[j:j + 1], frame.places[k][None, None],
+                                            frame.normals[k][None, None], frame.spacing[k][None, None])
+                    key, value = layer.key_value(codes.value[b, k]).chunk(2)
+                    relates, offset = layer.lie(lie)[0, 0].chunk(2)
+                    scores.append(layer.weigh((asks + key + relates).relu()))
+                    values.append(value + offset)
+                latent = latent + (torch.stack(scores).softmax(0) * torch.stack(values)).sum(0)
+                latent = latent + layer.mix(layer.norms[1](latent))
             factor = (2 * torch.tanh(decoder.finish(latent) / 2)).exp()
             expected[b, j] = (torch.stack(own).softmax(0) * torch.stack(light)).sum() * factor
     found = decoder(codes, frame, places, normals, direct, near)
@@ -172,7 +223,7 @@ def test_the_decoder_is_vector_attention(room, model):
 
 def frame_of(points, settings=TINY):
     return networks.Frame.of(torch.from_numpy(points.places), torch.from_numpy(points.normals),
-                             embedding.layout(points.places, settings.gathered, settings.around))
+                             embedding.layout(points.places, settings.halvings, settings.gathered, settings.around))
 
 
 def test_the_order_of_the_scene_points_does_not_matter_up_to_where_sampling_starts(room, model):

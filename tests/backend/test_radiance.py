@@ -66,7 +66,7 @@ def test_codes_and_queries_are_as_in_a_loop():
         return torch.rand(*size, generator=rng)
 
     places, normals = drawn(40, 3), torch.nn.functional.normalize(drawn(40, 3) - 0.5, dim=1)
-    layout = base.embedding.layout(places.numpy(), settings.gathered, settings.around)
+    layout = base.embedding.layout(places.numpy(), settings.halvings, settings.gathered, settings.around)
     frame = networks.Frame.of(places, normals, layout)
     codes = networks.Codes(drawn(2, 10), drawn(2, 10, 16), drawn(2, 10, 16))
     light, shape, lobes = drawn(2, 40), drawn(2, 40, 25), drawn(40, 25)

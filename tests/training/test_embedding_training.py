@@ -11,11 +11,11 @@ torch = pytest.importorskip("torch")
 from neural_gash_addon.backend import embedding_bake, methods  # noqa: E402
 from neural_gash_addon.backend.exchange import write_npz  # noqa: E402
 from neural_gash_addon.backend.lit_points import LitPoints  # noqa: E402
-from neural_gash_addon.backend.networks.embedding import Embedding, Settings  # noqa: E402
+from neural_gash_addon.backend.networks.embedding import FULL, Embedding, Settings  # noqa: E402
 from training import embedding, loop, room_labels, rooms  # noqa: E402
 
-TINY = Settings(width=32, blocks=2, hidden=16, gathered=6, around=4, patch=64, neighbours=5)
-RECIPE = embedding.Recipe(TINY, steps=16, rate=3e-3, rooms=2, queries=100, every=8)
+TINY = Settings(first=16, widths=(32, 32), hidden=16, gathered=6, around=4, patch=64, neighbours=5)
+RECIPE = embedding.Recipe(TINY, tuple(embedding.Phase(loss, 16, 3e-3, 2, 100, 8) for loss in ("logarithms", "values")))
 
 
 @pytest.fixture(autouse=True)
@@ -87,25 +87,43 @@ def test_equation_12_is_that_of_the_paper_and_what_it_is_relative_to_is_fixed():
     assert not dark.grad.any()
 
 
-@pytest.mark.parametrize("configuration, loss", [("full", "logarithms"), ("small", "values")])
-def test_each_configuration_takes_a_step_from_the_command_line(cache, tmp_path, monkeypatch, capsys, configuration,
-                                                               loss):
+@pytest.mark.parametrize("configuration", ["full", "small"])
+def test_each_configuration_takes_a_step_of_each_phase_from_the_command_line(cache, tmp_path, monkeypatch, capsys,
+                                                                             configuration):
     """The full one as large as it is, in tiny rooms and at few queries; where there is CUDA, there."""
     recipe = embedding.RECIPES[configuration]
-    assert recipe.rooms * recipe.queries == 8192
-    monkeypatch.setitem(embedding.RECIPES, configuration, replace(recipe, rooms=1, queries=40))
+    assert recipe.phases[0].loss == "logarithms" and all(each.rooms * each.queries == 8192 for each in recipe.phases)
+    few = tuple(replace(phase, rooms=1, queries=40) for phase in recipe.phases)
+    monkeypatch.setitem(embedding.RECIPES, configuration, replace(recipe, phases=few))
     monkeypatch.setattr(embedding, "HELD_OUT", 40)
-    monkeypatch.setattr("sys.argv", ["embedding", "--configuration", configuration, "--steps", "1", "--loss", loss,
-                                     "--cache", str(cache), "--out", str(tmp_path), "--logs", str(tmp_path)])
+    monkeypatch.setattr(embedding, "CACHE", cache)
+    command = ["embedding", "--configuration", configuration, "--cache", str(cache), "--out", str(tmp_path), "--logs",
+               str(tmp_path), "--steps"]
+    monkeypatch.setattr("sys.argv", [*command, *["1"] * len(few)])
     embedding.main()
     assert "3 rooms, 1 held out" in capsys.readouterr().out
-    log, = tmp_path.glob("*.csv")
-    assert log.stem == {"full": "embedding-full-logarithms", "small": "embedding"}[configuration]
-    assert len(losses_of(log)) == 1 and np.isfinite(losses_of(log)).all()
+    name = {"full": "embedding-full", "small": "embedding"}[configuration]
+    assert {log.stem for log in tmp_path.glob("*.csv")} == {f"{name}-{phase.loss}" for phase in recipe.phases}
+    assert all(len(losses_of(log)) == 1 and np.isfinite(losses_of(log)).all() for log in tmp_path.glob("*.csv"))
     with monkeypatch.context() as patch:
         patch.setattr(embedding_bake.weights, "FOLDER", tmp_path)
         model = embedding_bake.network()
-    assert model.settings == recipe.settings and len(model.encoder.blocks) == recipe.settings.blocks
+    assert model.settings == recipe.settings and len(model.encoder.transform.blocks) == len(recipe.settings.widths)
+    monkeypatch.setattr("sys.argv", [*command, "1", "1", "1"])
+    with pytest.raises(SystemExit):
+        embedding.main()
+    assert f"--steps needs {len(few)} numbers" in capsys.readouterr().err
+
+
+def test_the_full_configuration_is_that_of_table_3():
+    assert FULL.first == FULL.hidden == 128 and FULL.gathered == FULL.neighbours == 32 and FULL.patch == 1024
+    depths, channels = (2, 2, 2, 6, 2), (128, 128, 128, 256, 256)
+    assert FULL.widths == tuple(width for depth, width in zip(depths, channels, strict=True) for _ in range(depth))
+    assert FULL.halvings == (2, 2) and FULL.layers == 6 and FULL.dropout == 0.1
+    model = Embedding(FULL)
+    feed_forward = model.decoder.further[0].mix[0]
+    assert feed_forward.out_features == 512 and len(model.decoder.further) == 5
+    assert embedding.RECIPES["full"].phases[0].rate == 2e-4
 
 
 def losses_of(log):
@@ -117,36 +135,46 @@ class Stopped(Exception):
     pass
 
 
-def test_it_learns_and_goes_on_from_its_checkpoint(cache, tmp_path, monkeypatch):
+@pytest.mark.parametrize("saves", [1, 3])
+def test_it_learns_and_goes_on_from_its_checkpoint(cache, tmp_path, monkeypatch, saves):
+    """Stopped in either phase."""
     kept, held = embedding.rooms(cache, "train"), [held_out(cache)]
-    whole = embedding.train(RECIPE, kept, held, 3, tmp_path / "one", tmp_path / "one.csv")
-    losses = losses_of(tmp_path / "one.csv")
-    assert len(losses) == 2 and losses[1] < losses[0]
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+    whole = embedding.train(RECIPE, kept, held, 3, tmp_path / "one", tmp_path / "one")
+    losses = [losses_of(tmp_path / "one" / f"embedding-{phase.loss}.csv") for phase in RECIPE.phases]
+    assert [len(each) for each in losses] == [2, 2] and losses[0][1] < losses[0][0]
+    saved = []
 
     def save_and_stop(self, path, save=loop.Training.save):
         save(self, path)
-        raise Stopped
+        saved.append(path)
+        if len(saved) == saves:
+            raise Stopped
 
     with monkeypatch.context() as patch:
         patch.setattr(loop.Training, "save", save_and_stop)
         with pytest.raises(Stopped):
-            embedding.train(RECIPE, kept, held, 3, tmp_path / "two", tmp_path / "two.csv")
-    again = embedding.train(RECIPE, kept, held, 3, tmp_path / "two", tmp_path / "two.csv")
+            embedding.train(RECIPE, kept, held, 3, tmp_path / "two", tmp_path / "two")
+    again = embedding.train(RECIPE, kept, held, 3, tmp_path / "two", tmp_path / "two")
     for one, two in zip(whole.parameters(), again.parameters(), strict=True):
         np.testing.assert_allclose(two.detach(), one.detach(), atol=1e-6)
 
 
-def test_a_training_that_goes_on_begins_with_the_weights_that_ship(cache, tmp_path, monkeypatch):
-    torch.manual_seed(7)
-    shipped = Embedding(TINY)
-    monkeypatch.setattr(embedding_bake, "network", lambda: shipped)
+def test_a_later_phase_begins_with_what_the_one_before_learned(cache, tmp_path):
+    """And anew, where that was trained anew."""
     kept, held = embedding.rooms(cache, "train"), [held_out(cache)]
-    for goes_on in (True, False):
-        recipe = replace(RECIPE, steps=1, every=1, rate=1e-6, goes_on=goes_on)
-        made = embedding.train(recipe, kept, held, 3, tmp_path / f"{goes_on}", tmp_path / "log.csv")
-        torch.manual_seed(7)
-        assert goes_on == all(torch.allclose(one, two, atol=1e-4) for one, two in zip(
-            made.parameters(), Embedding(TINY).parameters(), strict=True))
+    still = [replace(RECIPE.phases[1], steps=1, every=1, rate=1e-7)]
+    learned = embedding.train(replace(RECIPE, phases=RECIPE.phases[:1]), kept, held, 3, tmp_path, tmp_path)
+    after = embedding.train(replace(RECIPE, phases=(RECIPE.phases[0], *still)), kept, held, 3, tmp_path, tmp_path)
+    for one, two in zip(learned.parameters(), after.parameters(), strict=True):
+        np.testing.assert_allclose(two.detach(), one.detach(), atol=1e-5)
+    (tmp_path / "embedding-logarithms.checkpoint").unlink()
+    short = replace(RECIPE.phases[0], steps=2, every=2)
+    anew = embedding.train(replace(RECIPE, phases=(short, *still)), kept, held, 3, tmp_path, tmp_path)
+    alone = embedding.train(replace(RECIPE, phases=(short,)), kept, held, 3, tmp_path, tmp_path)
+    for one, two in zip(alone.parameters(), anew.parameters(), strict=True):
+        np.testing.assert_allclose(two.detach(), one.detach(), atol=1e-5)
 
 
 def test_training_asks_as_the_bake_does(cache):
@@ -188,7 +216,7 @@ def test_baselines_are_right_where_it_is_known():
     places = 2 * np.stack([round_ * np.cos(turns), round_ * np.sin(turns), rise], 1)
     points = np.concatenate([places, -places / 2, np.full((1000, 3), 0.5)], 1).astype(np.float32)
     sample = embedding.Sample(points, np.full((1000, 3), 3.0), np.full((2, 1000, 3), 7.0), points[::50], None,
-                              np.ones((20, 3)), np.zeros((20, 3)), embedding.embedding.layout(places, 6, 4), None, None)
+                              np.ones((20, 3)), np.zeros((20, 3)), embedding.embedding.layout(places, (2, 2), 6, 4), None, None)
     for name, give in embedding.BASELINES.items():
         expected = np.full((20, 3), 7.0 if "nearest" in name else 3.0)
         np.testing.assert_allclose(give(sample, np.arange(20)), expected, rtol=0.2, err_msg=name)

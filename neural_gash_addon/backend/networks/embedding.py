@@ -8,7 +8,7 @@ differs from the paper, and why (docs/embedding.md has more):
 - All light is in units of its mean over the room, colour channels are separate items of a batch, and what is read of
   geometry are distances in units of the codes' spacing and cosines: brighter, recoloured, moved, turned, mirrored or
   larger rooms give the same answer by construction, where the paper leaves that to be learned.
-- One step of nearest-neighbour embedding, from M points to M / 4 codes; all blocks are of one width.
+- The transformer has no stages: its blocks may become wider, and all are of the same codes.
 - Its Point Transformer V3 finds a code's surroundings by sparse convolution; here a depthwise one over the nearest
   codes, its kernel a perceptron of how they lie.
 - Equation 10 has no normalisation. Over softmax weights of a perceptron of equation 9, as in the works that it cites
@@ -38,17 +38,22 @@ _LEAST = 1e-3       # of the mean spacing: points that coincide have none
 class Settings:
     """Sizes."""
 
-    width: int             # D, of codes in the encoder
-    blocks: int            # of the point transformer
-    hidden: int            # of codes that queries read
-    gathered: int = 32     # k of the nearest-neighbour embedding
-    around: int = 16       # codes of a depthwise convolution: on a surface, those within two spacings
-    patch: int = 1024      # codes that attend to each other, at most: cost grows with M, not with M²
-    neighbours: int = 16   # k of the decoder: more gain little (docs/embedding.md)
+    first: int                          # what a scene point is projected to (equation 1)
+    widths: tuple[int, ...]             # of the blocks of the point transformer; codes come to it in the first
+    hidden: int                         # of codes that queries read
+    halvings: tuple[int, ...] = (2, 2)  # steps of the nearest-neighbour embedding: points to a point, each
+    gathered: int = 32                  # k of these
+    around: int = 16                    # codes of a depthwise convolution: on a surface, those within two spacings
+    patch: int = 1024                   # codes that attend to each other, at most: cost grows with M, not with M²
+    neighbours: int = 16                # k of the decoder: more gain little (docs/embedding.md)
+    layers: int = 1                     # of the decoder of irradiance
+    wider: int = 2                      # perceptrons within are as many times as wide as what they are added to
+    dropout: float = 0.0
 
 
-SMALL = Settings(width=64, blocks=2, hidden=32)              # an hour of one busy CPU core
-FULL = Settings(width=256, blocks=14, hidden=128, neighbours=32)  # as large as the paper's Table 3
+SMALL = Settings(first=32, widths=(64, 64), hidden=32)
+FULL = Settings(first=128, widths=(128,) * 6 + (256,) * 8, hidden=128, neighbours=32, layers=6, wider=4, dropout=0.1)
+"""The paper's Table 3: depths 2, 2, 2, 6, 2 of 128, 128, 128, 256 and 256 channels."""
 
 
 def relation(places: Tensor, normals: Tensor, others: Tensor, other_normals: Tensor, spacing: Tensor) -> Tensor:
@@ -102,23 +107,29 @@ class Frame:
     areas: Tensor       # (M,) square metres, about
     spacing: Tensor     # (m,) metres between codes, about
     gathered: Tensor    # (m, k) the points nearest to each code
+    halvings: tuple[Tensor, ...]  # of each step from M points to m: (to, k) those before it nearest to each
     around: Tensor      # (m, k) the codes nearest to each, itself first
     orders: Tensor      # (CURVES, m) of the codes along each curve
 
     @classmethod
     def of(cls, places: Tensor, normals: Tensor, layout: embedding.Layout) -> Frame:
         """places, normals: (M, 3) on their device."""
-        gathered, around, orders, areas = (torch.from_numpy(array).to(places.device) for array in (
-            layout.gathered, layout.around, layout.orders, layout.areas))
-        spacing = (areas[:len(around)] * len(areas) / len(around)).sqrt()
-        return cls(places, normals, areas, spacing.clamp_min(_LEAST * float(spacing.mean()) + 1e-12), gathered, around,
-                   orders)
+        gathered, around, orders, areas, *halvings = (torch.from_numpy(array).to(places.device) for array in (
+            layout.gathered, layout.around, layout.orders, layout.areas, *layout.halvings))
+        return cls(places, normals, areas, _spacing(areas, len(around)), gathered, tuple(halvings), around, orders)
 
     def lie(self, rows: Tensor) -> Tensor:
-        """(m, k, RELATION) of points (m, k) about each code."""
-        codes = slice(len(self.around))
-        return relation(self.places[codes], self.normals[codes], self.places[rows], self.normals[rows],
-                        self.spacing[:, None])
+        """(n, k, RELATION) of points (n, k) about each of the first n, in units of how far those are apart."""
+        first = slice(len(rows))
+        spacing = self.spacing if len(rows) == len(self.spacing) else _spacing(self.areas, len(rows))
+        return relation(self.places[first], self.normals[first], self.places[rows], self.normals[rows],
+                        spacing[:, None])
+
+
+def _spacing(areas: Tensor, count: int) -> Tensor:
+    """(count,) metres between the first so many of the points that areas (M,) are of, about."""
+    spacing = (areas[:count] * len(areas) / count).sqrt()
+    return spacing.clamp_min(_LEAST * float(spacing.mean()) + 1e-12)
 
 
 def level(light: Tensor, areas: Tensor) -> Tensor:
@@ -167,17 +178,80 @@ class PatchAttention(nn.Module):
 class Block(nn.Module):
     """Of Point Transformer V3: surroundings, attention, perceptron, each added to what was there."""
 
-    def __init__(self, channels: int, patch: int) -> None:
+    def __init__(self, before: int, channels: int, settings: Settings) -> None:
         super().__init__()
-        self.surroundings, self.attention = Surroundings(channels), PatchAttention(channels, patch)
-        self.mix = _perceptron(channels, 2 * channels, channels)
+        self.widen = nn.Identity() if before == channels else nn.Linear(before, channels)
+        self.surroundings, self.attention = Surroundings(channels), PatchAttention(channels, settings.patch)
+        self.mix = _perceptron(channels, settings.wider * channels, channels)
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(2))
+        self.drop = nn.Dropout(settings.dropout)
 
     def forward(self, x: Tensor, lie: Tensor, around: Tensor, order: Tensor) -> Tensor:
-        """(B, m, C) to the same."""
+        """(B, m, before) to (B, m, C)."""
+        x = self.widen(x)
         x = x + self.surroundings(x, lie, around)
-        x = x + self.attention(self.norms[0](x), order)
-        return x + self.mix(self.norms[1](x))
+        x = x + self.drop(self.attention(self.norms[0](x), order))
+        return x + self.drop(self.mix(self.norms[1](x)))
+
+
+class PointTransformer(nn.Module):
+    """Equation 4: blocks, each along the next curve; in training, curves come in an order drawn anew each time.
+
+    Wu et al. 2024, "Point Transformer V3", "shuffle order".
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        super().__init__()
+        widths = settings.widths
+        self.blocks = nn.ModuleList(Block(before, width, settings)
+                                    for before, width in zip(widths[:1] + widths, widths, strict=False))
+        self.leave = nn.LayerNorm(widths[-1])
+
+    def forward(self, x: Tensor, frame: Frame) -> Tensor:
+        """(B, m, widths[0]) to (B, m, widths[-1])."""
+        curves = torch.randperm(CURVES).tolist() if self.training else list(range(CURVES))
+        lie = frame.lie(frame.around)
+        for number, block in enumerate(self.blocks):
+            x = block(x, lie, frame.around, frame.orders[curves[number % CURVES]])
+        return self.leave(x)
+
+
+class Halving(nn.Module):
+    """Equations 2 and 3: the greatest, by channel, of what the points about a point are beside it.
+
+    What is greatest also depends on how they lie.
+    """
+
+    def __init__(self, before: int, after: int) -> None:
+        super().__init__()
+        self.difference, self.centre = nn.Linear(before, after, bias=False), nn.Linear(before, after)
+        self.offset = _perceptron(RELATION, 16, after)
+        self.norm = nn.LayerNorm(after)
+
+    def forward(self, x: Tensor, near: Tensor, lie: Tensor) -> Tensor:
+        """(B, before, C) to (B, n, C'), n the points (n, k) `near`, which lie (n, k, RELATION)."""
+        kept, difference = x[:, :len(near)], self.difference(x)
+        greatest = (difference[:, near] + self.offset(lie)).amax(2)
+        return functional.gelu(self.norm(greatest - difference[:, :len(near)] + self.centre(kept)))
+
+
+class NearestNeighbourEmbedding(nn.Module):
+    """Equations 1 to 3: what M points carry to m codes, halving by halving."""
+
+    def __init__(self, carried: int, beside: int, settings: Settings) -> None:
+        """carried: numbers of a scene point. beside: further numbers of a code."""
+        super().__init__()
+        first, width, steps = settings.first, settings.widths[0], len(settings.halvings)
+        self.enter = _perceptron(carried, first, first)
+        self.halvings = nn.ModuleList(Halving(first, first if step < steps - 1 else width) for step in range(steps))
+        self.join = nn.Linear(width + beside, width)
+
+    def forward(self, frame: Frame, carried: Tensor, beside: Tensor) -> Tensor:
+        """carried: (B, M, _). beside: (B, m, _). To (B, m, C)."""
+        x = self.enter(carried)
+        for halving, near in zip(self.halvings, frame.halvings, strict=True):
+            x = halving(x, near, frame.lie(near))
+        return self.join(torch.cat([x, beside], 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,15 +268,10 @@ class Encoder(nn.Module):
 
     def __init__(self, settings: Settings) -> None:
         super().__init__()
-        width = settings.width
-        self.enter = _perceptron(4, width, width)
+        width = settings.widths[-1]
         self.pool = Kernel(_SHARP)
-        self.difference, self.centre = nn.Linear(width, width, bias=False), nn.Linear(width, width)
-        self.offset = _perceptron(RELATION, 16, width)
-        self.join = nn.Linear(width + 3 * POOLS, width)
-        self.norm = nn.LayerNorm(width)
-        self.blocks = nn.ModuleList(Block(width, settings.patch) for _ in range(settings.blocks))
-        self.leave = nn.LayerNorm(width)
+        self.embed = NearestNeighbourEmbedding(4, 3 * POOLS, settings)
+        self.transform = PointTransformer(settings)
         self.factor, self.share = nn.Linear(width, 1), nn.Linear(width, POOLS)
         self.key, self.value = nn.Linear(width, settings.hidden), nn.Linear(width, settings.hidden)
         _silent(self.factor)
@@ -211,24 +280,14 @@ class Encoder(nn.Module):
     def forward(self, frame: Frame, albedo: Tensor, direct: Tensor, indirect: Tensor) -> Codes:
         """albedo, direct, indirect: (B, M), the light in units of the level."""
         size = (frame.areas / frame.areas.mean().clamp_min(1e-30)).clamp_min(1e-3).log().expand_as(albedo)
-        x = self.enter(torch.stack([size, albedo, direct.log1p(), indirect.log1p()], 2))
-        near, lie = frame.gathered, frame.lie(frame.gathered)
-        weights = self.pool(lie).softmax(1)                                            # (m, k, POOLS)
+        near, weights = frame.gathered, self.pool(frame.lie(frame.gathered)).softmax(1)  # (m, k, POOLS)
         gathered = indirect[:, near]
         pooled, first = (torch.einsum("bmk,mkp->bmp", light, weights)                  # (B, m, POOLS)
                          for light in (gathered, (albedo * direct)[:, near]))
         spread = torch.einsum("bmk,mkp->bmp", gathered.square(), weights).sub(pooled.square()).clamp_min(1e-12).sqrt()
-        # equations 2 and 3, where what is greatest also depends on how the points lie
-        greatest = (self.difference(x)[:, near] + self.offset(lie)).amax(2)
-        codes = slice(len(near))
-        x = functional.gelu(self.norm(greatest - self.difference(x[:, codes]) + self.centre(x[:, codes])))
-        x = self.join(torch.cat([x, pooled.log1p(), first.log1p(), spread.log1p()], 2))
-        # each block takes the next curve; in training, in an order drawn anew (Wu et al. 2024, "shuffle order")
-        curves = torch.randperm(CURVES).tolist() if self.training else list(range(CURVES))
-        lie = frame.lie(frame.around)
-        for number, block in enumerate(self.blocks):
-            x = block(x, lie, frame.around, frame.orders[curves[number % CURVES]])
-        x = self.leave(x)
+        x = self.embed(frame, torch.stack([size, albedo, direct.log1p(), indirect.log1p()], 2),
+                       torch.cat([pooled, first, spread], 2).log1p())
+        x = self.transform(x, frame)
         light = (self.share(x).softmax(2) * pooled).sum(2)
         return Codes(light * _factor(self.factor(x)), self.key(x), self.value(x))
 
@@ -236,6 +295,28 @@ class Encoder(nn.Module):
 def _factor(raw: Tensor) -> Tensor:
     """(..., 1) of any size to factors (...), positive, 1 for 0."""
     return (_FARTHEST * torch.tanh(raw[..., 0] / _FARTHEST)).exp()
+
+
+class Further(nn.Module):
+    """A layer more of the decoder: from what a query has found, vector attention once more, and a perceptron."""
+
+    def __init__(self, settings: Settings) -> None:
+        super().__init__()
+        hidden = settings.hidden
+        self.norms = nn.ModuleList(nn.LayerNorm(hidden) for _ in range(2))
+        self.asks, self.key_value = nn.Linear(hidden, hidden, bias=False), nn.Linear(hidden, 2 * hidden)
+        self.lie = _perceptron(RELATION, hidden, 2 * hidden)
+        self.weigh = nn.Linear(hidden, hidden, bias=False)
+        self.mix = _perceptron(hidden, settings.wider * hidden, hidden)
+        self.drop = nn.Dropout(settings.dropout)
+
+    def forward(self, x: Tensor, codes: Codes, lie: Tensor, near: Tensor) -> Tensor:
+        """(B, n, H) to the same; how codes near (n, k) to each query lie (n, k, RELATION)."""
+        key, value = self.key_value(codes.value).chunk(2, 2)
+        relates, offset = self.lie(lie).chunk(2, 2)
+        weights = self.weigh((key[:, near] + relates + self.asks(self.norms[0](x))[:, :, None]).relu()).softmax(2)
+        x = x + self.drop((weights * (value[:, near] + offset)).sum(2))
+        return x + self.drop(self.mix(self.norms[1](x)))
 
 
 class Decoder(nn.Module):
@@ -251,6 +332,7 @@ class Decoder(nn.Module):
         self.lie = _perceptron(RELATION, hidden, 2 * hidden)
         self.asks = _perceptron(1, hidden, 2 * hidden)
         self.weigh = nn.Linear(hidden, 1 + hidden, bias=False)
+        self.further = nn.ModuleList(Further(settings) for _ in range(settings.layers - 1))
         self.finish = nn.Sequential(nn.LayerNorm(hidden), _silent(_perceptron(hidden, hidden, 1)))
 
     def forward(self, codes: Codes, frame: Frame, places: Tensor, normals: Tensor, direct: Tensor, near: Tensor
@@ -269,6 +351,8 @@ class Decoder(nn.Module):
         own = (weights[..., 0] + self.kernel(lie)[..., 0]).softmax(2)
         light = (own * codes.light[:, near]).sum(2)
         latent = latent + (weights[..., 1:].softmax(2) * (codes.value[:, near] + offset)).sum(2)
+        for layer in self.further:
+            latent = layer(latent, codes, lie, near)
         return light * _factor(self.finish(latent))
 
 

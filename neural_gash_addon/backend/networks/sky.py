@@ -20,10 +20,23 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..serialise import CURVES
 from ..spherical_harmonics import MAX_ORDER
-from .embedding import _SHARP, POOLS, RELATION, Block, Frame, Kernel, Settings, _factor, _perceptron, _silent, relation
+from .embedding import (
+    _SHARP,
+    POOLS,
+    RELATION,
+    Frame,
+    Kernel,
+    NearestNeighbourEmbedding,
+    PointTransformer,
+    Settings,
+    _factor,
+    _perceptron,
+    _silent,
+    relation,
+)
 
+SKY = Settings(first=64, widths=(64, 64), hidden=32, halvings=(4,))  # two halvings were no better (docs/embedding.md)
 _OWN = 2.0  # at first: logarithm of the weight of a point's own numbers beside each of the averages about its code
 SEEN = 4   # numbers of a scene point that do not turn: its size, the whole, how uneven, and that along the normal
 
@@ -52,15 +65,10 @@ class Encoder(nn.Module):
 
     def __init__(self, settings: Settings) -> None:
         super().__init__()
-        width, hidden = settings.width, settings.hidden
-        self.enter = _perceptron(SEEN, width, width)
+        width, hidden = settings.widths[-1], settings.hidden
         self.pool = Kernel(_SHARP)
-        self.difference, self.centre = nn.Linear(width, width, bias=False), nn.Linear(width, width)
-        self.offset = _perceptron(RELATION, 16, width)
-        self.join = nn.Linear(width + 3 * POOLS, width)
-        self.norm = nn.LayerNorm(width)
-        self.blocks = nn.ModuleList(Block(width, settings.patch) for _ in range(settings.blocks))
-        self.leave = nn.LayerNorm(width)
+        self.embed = NearestNeighbourEmbedding(SEEN, 3 * POOLS, settings)
+        self.transform = PointTransformer(settings)
         self.share = nn.Linear(width, (1 + POOLS) * MAX_ORDER)
         _silent(self.share)
         self.own = _perceptron(SEEN, hidden, 2 * hidden)
@@ -73,23 +81,13 @@ class Encoder(nn.Module):
         whole, off = 4 * values[:, 0], 4 * along.square().sum(1).add(1e-12).sqrt()
         upright = 4 * (along * frame.normals).sum(1) / (whole.abs() + off + 1e-2)
         seen = torch.stack([size, whole.clamp_min(0).log1p(), off.log1p(), upright], 1)
-        x = self.enter(seen)
-        near, lie = frame.gathered, frame.lie(frame.gathered)
-        weights = self.pool(lie).softmax(1)                                     # (m, k, POOLS)
+        near, weights = frame.gathered, self.pool(frame.lie(frame.gathered)).softmax(1)  # (m, k, POOLS)
         gathered = values[near]                                                 # (m, k, K)
         pooled = torch.einsum("mkc,mkp->mpc", gathered, weights)
         spread = torch.einsum("mk,mkp->mp", gathered[..., 0].square(), weights).sub(pooled[..., 0].square())
-        greatest = (self.difference(x)[near] + self.offset(lie)).amax(1)        # equations 2 and 3
-        codes = slice(len(near))
-        x = functional.gelu(self.norm(greatest - self.difference(x[codes]) + self.centre(x[codes])))
-        x = self.join(torch.cat([x, (4 * pooled[..., 0]).clamp_min(0).log1p(),
-                                 (4 * spread.clamp_min(1e-12).sqrt()).log1p(),
-                                 (4 * pooled[..., 1:4].square().sum(2).add(1e-12).sqrt()).log1p()], 1))
-        curves = torch.randperm(CURVES).tolist() if self.training else list(range(CURVES))
-        lie, x = frame.lie(frame.around), x[None]
-        for number, block in enumerate(self.blocks):
-            x = block(x, lie, frame.around, frame.orders[curves[number % CURVES]])
-        x = self.leave(x)[0]
+        beside = torch.cat([(4 * pooled[..., 0]).clamp_min(0).log1p(), (4 * spread.clamp_min(1e-12).sqrt()).log1p(),
+                            (4 * pooled[..., 1:4].square().sum(2).add(1e-12).sqrt()).log1p()], 1)
+        x = self.transform(self.embed(frame, seen[None], beside[None]), frame)[0]
         mix = by_band(self.share(x).view(len(x), 1 + POOLS, MAX_ORDER).softmax(1), values.shape[1])
         mixed = mix[parents, 0] * values + (mix[:, 1:] * pooled).sum(1)[parents]
         key, value = (self.key_value(x)[parents] + self.own(seen)).chunk(2, 1)
