@@ -41,7 +41,7 @@ def _child(count: int, queries: int) -> None:
         positions[np.arange(number), axis] = side * np.array([8, 6, 3])[axis]
         normals = np.zeros((number, 3))
         normals[np.arange(number), axis] = 1 - 2 * side
-        return LitPoints(*(each.astype(np.float32) for each in (positions, normals, *rng.random((3, number, 3)))))
+        return LitPoints(*(each.astype(np.float32) for each in (positions, normals, *rng.random((4, number, 3)))))
 
     def asked(room: embedding_bake.Room, queries: LitPoints) -> None:
         methods.run(room.reflected(queries.places, queries.normals, queries.direct))

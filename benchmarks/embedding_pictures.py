@@ -81,7 +81,7 @@ def main() -> None:
 
         def untrained(seen=seen, places=places, scene=scene, occluders=occluders, traced=traced) -> dict[str, NDArray]:
             points, direct = methods.run(lit_points(scene, occluders, threads=1)), traced(STRAIGHT, 4, depth=1)
-            every = np.concatenate([points.places, points.normals, points.albedo], 1)
+            every = np.concatenate([points.places, points.normals, points.albedo, points.emission], 1)
             sample = judging.Sample(every, points.direct, points.indirect[None], seen.queries, None, None, None,
                                     embedding.layout(points.places, (2, 2), 32, 16), None, None)
             return {name: direct + give(sample, np.arange(len(places))) for name, give in judging.BASELINES.items()}

@@ -55,14 +55,14 @@ class Recipe:
 
 RECIPES = {"small": Recipe(SMALL, (Phase("logarithms", 480, 2e-3, 4, 2048, 60),   # an hour of one CPU core
                                    Phase("values", 240, 1e-3, 4, 2048, 60))),
-           "full": Recipe(FULL, (Phase("logarithms", 200_000, 2e-4, 4, 2048, 2_000),))}
+           "full": Recipe(FULL, (Phase("logarithms", 2_000_000, 2e-4, 4, 2048, 10_000),))}
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
     """A labelled room, with what never changes of it."""
 
-    points: NDArray[np.float32]     # (M, 9) position, normal, albedo
+    points: NDArray[np.float32]     # (M, 12) position, normal, albedo, emission
     direct: NDArray[np.float32]     # (M, 3) light straight from emitters, there
     looks: NDArray[np.float32]      # (LOOKS, M, 3) reflected light there, noisy
     queries: NDArray[np.float32]    # (N, 9) position, normal, albedo
@@ -107,9 +107,10 @@ def answer(model: nn.Module, sample: Sample, rows: NDArray, look: int = 0) -> tu
 
     middle = sample.points[:, :3].mean(0)
     frame = Frame.of(tensor(sample.points[:, :3] - middle), tensor(sample.points[:, 3:6]), sample.layout)
-    albedo, direct, indirect = (tensor(each.T) for each in (sample.points[:, 6:], sample.direct, sample.looks[look]))
+    albedo, emission, direct, indirect = (tensor(each.T) for each in (
+        sample.points[:, 6:9], np.pi * sample.points[:, 9:], sample.direct, sample.looks[look]))
     unit = level(indirect, frame.areas).clamp_min(1e-30)[:, None]
-    codes = model.encoder(frame, albedo, direct / unit, indirect / unit)
+    codes = model.encoder(frame, albedo, emission / unit, direct / unit, indirect / unit)
     found = model.decoder(codes, frame, tensor(sample.queries[rows, :3] - middle), tensor(sample.queries[rows, 3:6]),
                           tensor(sample.asked[rows].T) / unit, tensor(sample.near[rows].astype(np.int64)))
     return found, tensor(sample.truth[rows].T) / unit, tensor(sample.guide[rows].T) / unit
@@ -163,8 +164,8 @@ def network(model: nn.Module, sample: Sample) -> NDArray:
 def sphere(sample: Sample, rows: NDArray) -> NDArray:
     """(n, 3) reflected light in an integrating sphere of the room's mean albedo and mean light off surfaces."""
     share = sample.layout.areas / sample.layout.areas.sum()
-    first = share @ (sample.points[:, 6:] * sample.direct)
-    return np.tile(first / (1 - share @ sample.points[:, 6:]), (len(rows), 1))
+    first = share @ (sample.points[:, 6:9] * sample.direct)
+    return np.tile(first / (1 - share @ sample.points[:, 6:9]), (len(rows), 1))
 
 
 def one_bounce(sample: Sample, rows: NDArray) -> NDArray:
@@ -176,8 +177,8 @@ def one_bounce(sample: Sample, rows: NDArray) -> NDArray:
         here = np.einsum("nmx,nx->nm", way, sample.queries[some, 3:6]).clip(0)
         there = -np.einsum("nmx,mx->nm", way, sample.points[:, 3:6]).clip(max=0)
         form = here * there * areas / np.pi / (square * (square + areas / np.pi)).clip(1e-20)
-        out.append(form @ (sample.points[:, 6:] * sample.direct))
-    return np.concatenate(out) / (1 - areas @ sample.points[:, 6:] / areas.sum())
+        out.append(form @ (sample.points[:, 6:9] * sample.direct))
+    return np.concatenate(out) / (1 - areas @ sample.points[:, 6:9] / areas.sum())
 
 
 def near_mean(queries: NDArray, points: NDArray, light: NDArray, count: int) -> NDArray[np.float32]:
@@ -209,11 +210,12 @@ def train(recipe: Recipe, kept: list[Path], held: list[Sample], seed: int, cache
     torch.manual_seed(seed)
     model = Embedding(recipe.settings).to(loop.device())
     before: Path | None = None
-    for phase in recipe.phases:
+    for number, phase in enumerate(recipe.phases):
         checkpoint = cache / f"{name}-{phase.loss}.checkpoint"
         if before and checkpoint.exists() and checkpoint.stat().st_mtime < before.stat().st_mtime:
             checkpoint.unlink()
-        model = in_phase(model, recipe.settings, phase, kept, held, seed, checkpoint, logs / f"{name}-{phase.loss}.csv")
+        model = in_phase(model, recipe.settings, phase, kept, held, seed + number * 1000, checkpoint,
+                         logs / f"{name}-{phase.loss}.csv")
         before = checkpoint
     return model
 

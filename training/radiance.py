@@ -59,12 +59,12 @@ class Room:
         """Level (3, 1), codes, reflected light of the scene points (3, M), light straight and reflected at queries."""
         if number not in self._looks:
             sample, model = self.sample, trained()
-            albedo, direct, indirect = (_tensor(each.T) for each in (sample.points[:, 6:], sample.direct,
-                                                                     sample.looks[number]))
+            albedo, emission, direct, indirect = (_tensor(each.T) for each in (
+                sample.points[:, 6:9], np.pi * sample.points[:, 9:], sample.direct, sample.looks[number]))
             unit = level(indirect, self.frame.areas).clamp_min(1e-30)[:, None]
             asked = _tensor(sample.asked.T) / unit
             with torch.no_grad():
-                codes = model.encoder(self.frame, albedo, direct / unit, indirect / unit)
+                codes = model.encoder(self.frame, albedo, emission / unit, direct / unit, indirect / unit)
                 light = model.decoder(codes, self.frame, self.places, self.normals, asked, self.near)
             self._looks[number] = unit, codes, indirect / unit, asked, light
         return self._looks[number]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rooms with the light in them, to train on, made once and kept: `python -m training.room_labels --rooms 160`.
+"""Rooms with the light in them, to train on, made once and kept: `python -m training.room_labels --rooms 220`.
 
 One .npz a room (see `label`) in training/cache/rooms/, which git ignores. A run that was stopped goes on where it
 was; a file made with other settings, or by another version of the generator, has another name. Light straight from
@@ -135,12 +135,12 @@ def label(scene: LitScene, *, seed: int, split: str, rays: int, points: int | No
     """A scene as the network wants it, by KEYS. Metres, linear RGB, W/m^2.
 
     Returns:
-        scene_points (M, 9) position, unit normal, albedo, so ordered that its first points are a good sample too, and
-        the light there as `lit_points` has it: point_direct (M, 3), point_indirect (LOOKS, M, 3), point_shape
-        (LOOKS, M, K, 3), float16; queries (N, 9) as scene_points; direct, indirect (N, 3) irradiance straight from
-        emitters and reflected, and direct_noise, indirect_noise (N, 3), their standard errors; shape (N, K, 3) of
-        ORDER, reflected light by direction (`irradiance.Irradiance`), and shape_noise (N, ORDER, 3), the root of the
-        sum of its squared standard errors in each band; seed; split. All else float32.
+        scene_points (M, 12) position, unit normal, albedo, emission (radiance), so ordered that its first points are a
+        good sample too, and the light there as `lit_points` has it: point_direct (M, 3), point_indirect (LOOKS, M, 3),
+        point_shape (LOOKS, M, K, 3), float16; queries (N, 9) as scene_points, without emission; direct, indirect (N, 3)
+        irradiance straight from emitters and reflected, and direct_noise, indirect_noise (N, 3), their standard errors;
+        shape (N, K, 3) of ORDER, reflected light by direction (`irradiance.Irradiance`), and shape_noise (N, ORDER, 3),
+        the root of the sum of its squared standard errors in each band; seed; split. All else float32.
     """
     number, occluders = abs(seed), scene.occluders()
     asked = visible_points(scene, queries, number, occluders)
@@ -154,7 +154,8 @@ def label(scene: LitScene, *, seed: int, split: str, rays: int, points: int | No
     others = [traced(lit.places, lit.normals, REFLECTED, False, look) for look in range(1, LOOKS)]
     direct = traced(asked[:, :3], asked[:, 3:6], DIRECT_RAYS, True, LOOKS)
     indirect = traced(asked[:, :3], asked[:, 3:6], rays, False, LOOKS)
-    return {"scene_points": np.concatenate([lit.places, lit.normals, lit.albedo], 1), "point_direct": lit.direct,
+    return {"scene_points": np.concatenate([lit.places, lit.normals, lit.albedo, lit.emission], 1),
+            "point_direct": lit.direct,
             "point_indirect": np.stack([lit.indirect, *(other.values for other in others)]),
             "point_shape": np.stack([lit.shape, *(other.shape for other in others)]).astype(np.float16),
             "queries": asked, "direct": direct.values, "direct_noise": direct.error, "indirect": indirect.values,

@@ -45,7 +45,8 @@ def network() -> Any:
     from .networks.embedding import FULL, SMALL, Embedding
 
     arrays = weights.load(weights.FOLDER / weights.EMBEDDING)
-    return weights.filled(Embedding(FULL if len(arrays["encoder.transform.leave.weight"]) == FULL.widths[-1] else SMALL), arrays)
+    width = len(arrays["encoder.transform.leave.weight"])
+    return weights.filled(Embedding(FULL if width == FULL.widths[-1] else SMALL), arrays)
 
 
 def radiance_network(model: Any) -> Any:
@@ -183,11 +184,12 @@ class Room:
         self._layout = embedding.layout(points.places, sizes.halvings, sizes.gathered, sizes.around)
         self._frame = Frame.of(self._tensor(points.places - self._centre), self._tensor(points.normals), self._layout)
         self._anchors = points.places[:len(self._layout.around)]
-        albedo, direct, indirect = (self._tensor(each.T) for each in (points.albedo, points.direct, points.indirect))
+        albedo, emission, direct, indirect = (self._tensor(each.T) for each in (
+            points.albedo, np.pi * points.emission, points.direct, points.indirect))
         self.level = level(indirect, self._frame.areas)  # (3,); zero where nothing was reflected
         unit = self.level.clamp_min(1e-30)[:, None]
         with torch.no_grad():
-            self.codes = model.encoder(self._frame, albedo, direct / unit, indirect / unit)
+            self.codes = model.encoder(self._frame, albedo, emission / unit, direct / unit, indirect / unit)
             if radiance is not None:
                 assert points.shape is not None
                 self._beyond = radiance.encode(

@@ -29,6 +29,7 @@ class LitPoints:
     places: Floats    # (M, 3) metres
     normals: Floats   # (M, 3) unit, of the side that is lit
     albedo: Floats    # (M, 3)
+    emission: Floats  # (M, 3) radiance, W m^-2 sr^-1
     direct: Floats    # (M, 3) irradiance straight from emitters, W/m^2
     indirect: Floats  # (M, 3) irradiance that was reflected, with the noise of REFLECTED paths
     shape: Floats | None = None  # (M, K, 3) where asked: the same by direction, see `irradiance.Irradiance`
@@ -69,4 +70,4 @@ def lit_points(scene: LitScene, occluders: Occluders, count: int | None = None, 
     normals[dark] *= -1
     direct[dark], indirect[dark], shape[dark] = yield from scaled(traced(dark), 0.8, 0.2)
     normals[dark[~(direct[dark].any(1) | indirect[dark].any(1))]] *= -1
-    return LitPoints(places, normals, points[:, 6:9], direct, indirect, shape if order else None)
+    return LitPoints(places, normals, points[:, 6:9], points[:, 9:], direct, indirect, shape if order else None)

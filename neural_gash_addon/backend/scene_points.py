@@ -21,7 +21,7 @@ _BUCKET = 256     # candidates updated together
 
 
 def scene_points(scene: LitScene, count: int, seed: int = 0) -> NDArray[np.float32]:
-    """Points on all triangles of a scene, each of a front.
+    """Points on all triangles of a scene, lamps within it among them, each of a front.
 
     Returns:
         (count, 12): position (metres), unit normal, albedo, emission (radiance). None where there is no area.
@@ -30,7 +30,8 @@ def scene_points(scene: LitScene, count: int, seed: int = 0) -> NDArray[np.float
     shining = np.zeros(len(scene.areas), bool)
     shining[scene.emitters] = True
     weights = np.where(shining, EMITTERS, 1.0)
-    weights[len(weights) - scene.bodiless:] = 0  # no surfaces
+    surfaces, lamps = np.split(scene.corners, [len(weights) - scene.bodiless])
+    weights[len(surfaces):] *= within(lamps, surfaces)
     cumulative = np.cumsum(scene.areas * weights ** 2)
     if not cumulative[-1] > 0:
         return np.zeros((0, 12), np.float32)
@@ -43,6 +44,14 @@ def scene_points(scene: LitScene, count: int, seed: int = 0) -> NDArray[np.float
     kept = farthest(places, count, weights[faces] ** 2)
     return np.concatenate([points[kept], scene.normals[faces[kept]], scene.albedo_at(faces[kept], u[kept], v[kept]),
                            scene.emission[faces[kept]]], 1).astype(np.float32)
+
+
+def within(lamps: NDArray, surfaces: NDArray) -> NDArray[np.bool_]:
+    """(L,) whether lamps (L, 3, 3) are within the bounds of surfaces (F, 3, 3): those beyond light a room, and are no
+    part of it.
+    """
+    low, high = surfaces.reshape(-1, 3).min(0), surfaces.reshape(-1, 3).max(0)
+    return ((lamps >= low) & (lamps <= high)).all((1, 2))
 
 
 def farthest(places: NDArray, count: int, weights: NDArray | None = None) -> NDArray[np.int64]:

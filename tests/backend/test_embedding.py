@@ -17,8 +17,8 @@ from neural_gash_addon.backend.lit_scene import LitScene  # noqa: E402
 from neural_gash_addon.backend.methods import run  # noqa: E402
 from neural_gash_addon.backend.networks import embedding as networks  # noqa: E402
 
-TINY = networks.Settings(first=16, widths=(32, 32, 64), hidden=16, gathered=6, around=4, patch=16, neighbours=5, layers=3,
-                         dropout=0.1)
+TINY = networks.Settings(first=16, widths=(32, 32, 64), hidden=16, gathered=6, around=4, patch=16, neighbours=5,
+                         layers=2)
 POINTS = 150
 
 
@@ -36,7 +36,8 @@ def room():
     direct, indirect = near * [20, 15, 10], rng.gamma(1, 1, (count, 3)) * (near + 0.3) * [3, 2, 1]
     chosen = farthest(positions, POINTS)
     points = LitPoints(*(each[chosen].astype(np.float32)
-                         for each in (positions, normals, rng.random((count, 3)) * 0.8, direct, indirect)))
+                         for each in (positions, normals, rng.random((count, 3)) * 0.8,
+                                      np.where(rng.random((count, 1)) < 0.1, direct, 0), direct, indirect)))
     return points, tuple(each[-60:].astype(np.float32) for each in (positions, normals, direct))
 
 
@@ -132,8 +133,8 @@ def test_a_halving_is_the_greatest_of_what_points_about_a_point_are_beside_it(ro
             each = []
             for k in near[row]:
                 way = (frame.places[k] - frame.places[row]) / spacing
-                lie = torch.stack([way @ frame.normals[row], way @ frame.normals[k], way.norm(), way.square().sum().log1p(),
-                                   frame.normals[k] @ frame.normals[row]])
+                lie = torch.stack([way @ frame.normals[row], way @ frame.normals[k], way.norm(),
+                                   way.square().sum().log1p(), frame.normals[k] @ frame.normals[row]])
                 each.append(layer.difference(x[b, k] - x[b, row]) + layer.centre(x[b, row]) + layer.offset(lie))
             expected[b, row] = torch.nn.functional.gelu(layer.norm(torch.stack(each).amax(0)))
     found = layer(x, near, frame.lie(near))
@@ -144,7 +145,7 @@ def test_a_code_gathers_from_points_about_points_about_it(room, model):
     """Halving by halving: what a scene point carries reaches just the codes that have it in reach."""
     frame = frame_of(room[0])
     first, second = (each.numpy() for each in frame.halvings)
-    carried, beside = torch.rand(1, POINTS, 4), torch.zeros(1, 38, 3 * networks.POOLS)
+    carried, beside = torch.rand(1, POINTS, 5), torch.zeros(1, 38, 3 * networks.POOLS)
     before = model.encoder.embed(frame, carried, beside)
     reached = np.zeros(38, bool)
     for point in range(0, POINTS, 10):
@@ -183,10 +184,11 @@ def test_attention_is_among_the_codes_of_a_patch(count):
 
 
 def test_the_decoder_is_vector_attention(room, model):
-    """Equations 8 to 10 one code at a time, layer by layer; beside it the mean of light by the first of the weights."""
+    """Equations 8 to 10 one code at a time, layer by layer; and the mean of light by the first of the weights."""
     decoder, rng = model.decoder, torch.Generator().manual_seed(0)
     frame = frame_of(room[0])
-    codes = networks.Codes(*(torch.randn(2, 38, *size, generator=rng) for size in ((), (16,), (16,))))
+    codes = networks.Codes(*(torch.randn(2, 38, *size, generator=rng) for size in ((), (16,), (16,))), tuple(
+        tuple(torch.randn(2, 2, 38, 16, generator=rng)) for _ in decoder.further))
     places, normals = (torch.from_numpy(each[:6]) for each in room[1][:2])
     direct, near = torch.rand(2, 6, generator=rng), torch.randint(0, 38, (6, 5), generator=rng)
     expected = torch.empty(2, 6)
@@ -204,15 +206,14 @@ def test_the_decoder_is_vector_attention(room, model):
                 values.append(codes.value[b, k] + offset)
                 light.append(codes.light[b, k])
             latent = kept + (torch.stack(scores).softmax(0) * torch.stack(values)).sum(0)
-            for layer in decoder.further:
+            for layer, (keys, kept_values) in zip(decoder.further, codes.further, strict=True):
                 asks, scores, values = layer.asks(layer.norms[0](latent)), [], []
                 for k in near[j]:
                     lie = networks.relation(places[j:j + 1], normals[j:j + 1], frame.places[k][None, None],
                                             frame.normals[k][None, None], frame.spacing[k][None, None])
-                    key, value = layer.key_value(codes.value[b, k]).chunk(2)
                     relates, offset = layer.lie(lie)[0, 0].chunk(2)
-                    scores.append(layer.weigh((asks + key + relates).relu()))
-                    values.append(value + offset)
+                    scores.append(layer.weigh((asks + keys[b, k] + relates).relu()))
+                    values.append(kept_values[b, k] + offset)
                 latent = latent + (torch.stack(scores).softmax(0) * torch.stack(values)).sum(0)
                 latent = latent + layer.mix(layer.norms[1](latent))
             factor = (2 * torch.tanh(decoder.finish(latent) / 2)).exp()
@@ -254,7 +255,8 @@ def test_light_is_linear_and_channels_are_apart(room, model):
     whole = reflected(model, points, (places, normals, direct))
 
     def lit(give):
-        return reflected(model, changed(points, direct=give(points.direct), indirect=give(points.indirect)),
+        return reflected(model, changed(points, emission=give(points.emission), direct=give(points.direct),
+                                        indirect=give(points.indirect)),
                          (places, normals, give(direct)))
 
     for factor in (2.0 ** -20, 2.0 ** 20):  # by powers of two nothing is rounded otherwise
@@ -265,7 +267,8 @@ def test_light_is_linear_and_channels_are_apart(room, model):
     assert (dark[:, 1] == 0).all()
     np.testing.assert_allclose(dark[:, ::2], whole[:, ::2], rtol=1e-4)
     turn = [1, 2, 0]
-    turned = reflected(model, LitPoints(points.places, points.normals, points.albedo[:, turn], points.direct[:, turn],
+    turned = reflected(model, LitPoints(points.places, points.normals, points.albedo[:, turn],
+                                        points.emission[:, turn], points.direct[:, turn],
                                         points.indirect[:, turn]), (places, normals, direct[:, turn]))
     np.testing.assert_allclose(turned, whole[:, turn], rtol=1e-4)
 
@@ -285,12 +288,12 @@ def test_a_room_may_stand_anywhere_in_any_size(room, matrix):
 
 def points_of(array):
     array = array.astype(np.float32)
-    return LitPoints(*(array[:, at:at + 3] for at in range(0, 15, 3)))
+    return LitPoints(*(array[:, at:at + 3] for at in range(0, 18, 3)))
 
 
 @pytest.mark.parametrize("array", [
-    np.ones((1, 15)), np.ones((300, 15)), np.ones((3, 15)), np.eye(15)[:5], np.zeros((40, 15)),
-    np.concatenate([np.random.default_rng(0).random((50, 9)), np.zeros((50, 6))], 1)],
+    np.ones((1, 18)), np.ones((300, 18)), np.ones((3, 18)), np.eye(18)[:5], np.zeros((40, 18)),
+    np.concatenate([np.random.default_rng(0).random((50, 12)), np.zeros((50, 6))], 1)],
     ids=["one point", "one place", "fewer than k", "few", "black", "no light"])
 @pytest.mark.parametrize("settings", [TINY, networks.SMALL], ids=["tiny", "small"])
 def test_degenerate_rooms_have_numbers_and_are_dark_where_there_is_no_light(array, settings):
@@ -314,7 +317,8 @@ def asked(model, room):
     """The network's answer, with gradients."""
     points, (places, normals, direct) = room
     frame = frame_of(points, model.settings)
-    light = [torch.from_numpy(each).T for each in (points.albedo, points.direct, points.indirect)]
+    light = [torch.from_numpy(each).T for each in (points.albedo, np.pi * points.emission, points.direct,
+                                                   points.indirect)]
     near = embedding.nearest_to(places, points.places[:38], model.settings.neighbours)
     return model.decoder(model.encoder(frame, *light), frame, torch.from_numpy(places), torch.from_numpy(normals),
                          torch.from_numpy(direct).T, torch.from_numpy(near))
@@ -326,6 +330,23 @@ def test_every_weight_is_learned_from(room):
     asked(model, room).square().mean().backward()
     for name, parameter in model.named_parameters():
         assert parameter.grad is not None and parameter.grad.abs().max() > 1e-7, name
+
+
+def test_dropout_acts_in_training_alone(room):
+    """With one curve to walk, so that nothing else is drawn."""
+    dropping = network(networks.Settings(**{**vars(TINY), "dropout": 0.3}))
+    assert torch.equal(asked(dropping, room), asked(dropping, room))
+    assert torch.equal(asked(dropping, room), asked(network(), room))
+    orders = {}
+
+    def unshuffled(count, orders=orders):
+        return orders.setdefault(count, torch.arange(count))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(networks.torch, "randperm", unshuffled)
+        still, dropping = network().train(), dropping.train()
+        assert torch.equal(asked(still, room), asked(still, room))
+        assert not torch.allclose(asked(dropping, room), asked(dropping, room), rtol=1e-3)
 
 
 def test_curves_are_shuffled_in_training_alone_and_by_the_seed(room):

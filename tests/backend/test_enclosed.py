@@ -40,7 +40,8 @@ def test_nothing_encloses_what_faces_away_or_has_no_normal():
 
 def test_reflected_light_in_a_gap_is_traced_where_the_network_would_give_that_of_the_room(monkeypatch):
     torch.manual_seed(0)
-    monkeypatch.setattr(embedding_bake, "network", lambda: Embedding(Settings(first=16, widths=(32,), hidden=16)).eval())
+    settings = Settings(first=16, widths=(32,), hidden=16)
+    monkeypatch.setattr(embedding_bake, "network", lambda: Embedding(settings).eval())
     room = [Part(mesh, np.full(3, 0.6)) for mesh in shell([np.array([[0, 0, 0], [4, 3, 2.5]], float)]).values()]
     lamp = Part(place(box((0.5, 0.5, 0.02)), (2, 1.5, 2.4)), np.full(3, 0.6), np.array([20.0, 18, 15]))
     plate = Part(place(box((1, 1, 0.02)), (1, 1, 0.03)), np.full(3, 0.6))

@@ -126,8 +126,8 @@ def test_light_is_linear_and_channels_are_apart(room, models):
     _, whole = by_direction(models, points, (places, normals, direct))
 
     def lit(give):
-        changed = base.changed(points, direct=give(points.direct), indirect=give(points.indirect),
-                               shape=give(points.shape))
+        changed = base.changed(points, **{name: give(getattr(points, name))
+                                          for name in ("emission", "direct", "indirect", "shape")})
         return by_direction(models, changed, (places, normals, give(direct)))[1]
 
     for factor in (2.0 ** -20, 2.0 ** 20):  # by powers of two nothing is rounded otherwise
@@ -137,7 +137,8 @@ def test_light_is_linear_and_channels_are_apart(room, models):
     np.testing.assert_allclose(dark[..., ::2], whole[..., ::2], rtol=1e-3, atol=1e-5)
     turned = lit(lambda light: light[..., [1, 2, 0]])
     assert np.abs(turned - whole[..., [1, 2, 0]]).max() > 0  # the albedo stays
-    both = base.changed(points, albedo=points.albedo[:, [1, 2, 0]], direct=points.direct[:, [1, 2, 0]],
+    both = base.changed(points, albedo=points.albedo[:, [1, 2, 0]], emission=points.emission[:, [1, 2, 0]],
+                        direct=points.direct[:, [1, 2, 0]],
                         indirect=points.indirect[:, [1, 2, 0]], shape=points.shape[..., [1, 2, 0]])
     np.testing.assert_allclose(by_direction(models, both, (places, normals, direct[:, [1, 2, 0]]))[1],
                                whole[..., [1, 2, 0]], rtol=1e-3, atol=1e-5)
@@ -181,12 +182,13 @@ def test_every_weight_is_learned_from(room):
     torch.manual_seed(0)
     model, radiance = base.network(), decoder()
     frame = base.frame_of(points)
-    light = [torch.from_numpy(each.copy()).T for each in (points.albedo, points.direct, points.indirect)]
+    light = [torch.from_numpy(each.copy()).T for each in (points.albedo, np.pi * points.emission, points.direct,
+                                                          points.indirect)]
     with torch.no_grad():
         codes = model.encoder(frame, *light)
     lobes, asked = (torch.from_numpy(sh.cosine_lobe(each, 5)).float() for each in (points.normals, normals))
     near = torch.from_numpy(base.embedding.nearest_to(places, points.places[:38], 5))
-    beyond = radiance.encode(codes, frame, light[2], torch.from_numpy(points.shape.transpose(2, 0, 1).copy()), lobes)
+    beyond = radiance.encode(codes, frame, light[3], torch.from_numpy(points.shape.transpose(2, 0, 1).copy()), lobes)
     radiance(codes, beyond, frame, torch.from_numpy(places), torch.from_numpy(normals), asked,
              torch.from_numpy(direct).T, torch.rand(3, 60), near).square().mean().backward()
     for name, parameter in radiance.named_parameters():
@@ -194,7 +196,7 @@ def test_every_weight_is_learned_from(room):
 
 
 @pytest.mark.parametrize("array", [
-    np.ones((1, 15)), np.ones((300, 15)), np.ones((3, 15)), np.eye(15)[:5], np.zeros((40, 15))],
+    np.ones((1, 18)), np.ones((300, 18)), np.ones((3, 18)), np.eye(18)[:5], np.zeros((40, 18))],
     ids=["one point", "one place", "fewer than k", "few", "black"])
 def test_degenerate_rooms_have_numbers(array, models):
     points = base.points_of(array)

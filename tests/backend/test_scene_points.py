@@ -6,6 +6,7 @@ from scipy.spatial import cKDTree
 
 from neural_gash_addon.backend import scene_points as points
 from neural_gash_addon.backend.errors import UserError
+from neural_gash_addon.backend.lit_scene import LitScene
 
 from . import shapes
 from .test_irradiance import ceiling, quad, scene_of, textured_box
@@ -60,6 +61,22 @@ def test_density_is_by_area_and_higher_on_emitters():
     share = np.array([((found[:, 0] > low) & (found[:, 0] < low + 4)).mean() for low in (-0.5, 4.5, 19.5)])
     area = np.array([1, 9, points.EMITTERS ** 2])
     assert share == pytest.approx(area / area.sum(), rel=0.1)
+
+
+def test_lamps_without_a_body_have_points_where_they_are_part_of_the_room():
+    """Area lights: one below the ceiling, one beyond the wall."""
+    room = scene_of((*shapes.cube(inside=True), 0.5, 0))
+    lamp = np.array([[-0.1, -0.1, 0.4], [-0.1, 0.1, 0.4], [0.1, 0.1, 0.4], [0.1, -0.1, 0.4]])
+    corners = np.concatenate([lamp, lamp + [3, 0, 0]])
+    triangles = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32) + len(room.positions)
+    lit = LitScene(np.concatenate([room.positions, corners]), np.concatenate([room.triangles, triangles]),
+                   np.concatenate([room.albedo, np.zeros((4, 3))]),
+                   np.concatenate([room.emission, np.full((4, 3), 7.0)]), bodiless=4)
+    found = points.scene_points(lit, 600)
+    shining = found[:, 9:].any(1)
+    assert 34 <= shining.sum() < 50  # 34 by area; the rim of a small patch has some more
+    assert found[shining, 2] == pytest.approx(0.4) and np.abs(found[shining, :2]).max() < 0.101
+    assert found[shining, 9:] == pytest.approx(7) and not found[shining, 6:9].any()
 
 
 def test_any_first_points_are_blue_noise():

@@ -39,7 +39,9 @@ def box(seed):
     points = np.concatenate([positions, normals, np.full((count, 3), 0.4)], 1).astype(np.float32)
     light = ((1 + positions[:, 2:]) * rng.uniform(0.5, 3, 3)).astype(np.float32)
     looks = light[:400] * rng.gamma(16, 1 / 16, (2, 400, 1)).astype(np.float32)
-    return {"scene_points": points[:400], "point_direct": light[:400], "point_indirect": looks,
+    shining = np.where(rng.random((400, 1)) < 0.1, light[:400], 0).astype(np.float32)
+    return {"scene_points": np.concatenate([points[:400], shining], 1),
+            "point_direct": light[:400], "point_indirect": looks,
             "queries": points[400:], "direct": light[400:], "direct_noise": 0.01 * light[400:],
             "indirect": 1.5 * light[400:], "indirect_noise": np.zeros((600, 3), np.float32), "seed": np.array(seed)}
 
@@ -96,7 +98,6 @@ def test_each_configuration_takes_a_step_of_each_phase_from_the_command_line(cac
     few = tuple(replace(phase, rooms=1, queries=40) for phase in recipe.phases)
     monkeypatch.setitem(embedding.RECIPES, configuration, replace(recipe, phases=few))
     monkeypatch.setattr(embedding, "HELD_OUT", 40)
-    monkeypatch.setattr(embedding, "CACHE", cache)
     command = ["embedding", "--configuration", configuration, "--cache", str(cache), "--out", str(tmp_path), "--logs",
                str(tmp_path), "--steps"]
     monkeypatch.setattr("sys.argv", [*command, *["1"] * len(few)])
@@ -121,9 +122,10 @@ def test_the_full_configuration_is_that_of_table_3():
     assert FULL.widths == tuple(width for depth, width in zip(depths, channels, strict=True) for _ in range(depth))
     assert FULL.halvings == (2, 2) and FULL.layers == 6 and FULL.dropout == 0.1
     model = Embedding(FULL)
-    feed_forward = model.decoder.further[0].mix[0]
-    assert feed_forward.out_features == 512 and len(model.decoder.further) == 5
-    assert embedding.RECIPES["full"].phases[0].rate == 2e-4
+    assert model.decoder.further[0].mix[0].out_features == 512 and len(model.decoder.further) == 6
+    assert [block.attention.heads for block in model.encoder.transform.blocks] == [width // 32 for width in FULL.widths]
+    phase, = embedding.RECIPES["full"].phases
+    assert (phase.loss, phase.rate, phase.steps) == ("logarithms", 2e-4, 2_000_000)
 
 
 def losses_of(log):
@@ -184,7 +186,7 @@ def test_training_asks_as_the_bake_does(cache):
     torch.nn.init.normal_(model.encoder.factor.weight, std=0.5)
     sample = held_out(cache)
     rows = embedding.held_rows(sample)
-    points = LitPoints(*(sample.points[:, at:at + 3] for at in (0, 3, 6)), sample.direct, sample.looks[0])
+    points = LitPoints(*(sample.points[:, at:at + 3] for at in (0, 3, 6, 9)), sample.direct, sample.looks[0])
     queries = sample.queries[rows]
     baked = methods.run(embedding_bake.Room(model, points).reflected(queries[:, :3], queries[:, 3:6],
                                                                      sample.asked[rows]))
@@ -214,9 +216,10 @@ def test_baselines_are_right_where_it_is_known():
     turns, rise = np.arange(1000) * np.pi * (3 - 5 ** 0.5), 1 - (2 * np.arange(1000) + 1) / 1000
     round_ = np.sqrt(1 - rise ** 2)
     places = 2 * np.stack([round_ * np.cos(turns), round_ * np.sin(turns), rise], 1)
-    points = np.concatenate([places, -places / 2, np.full((1000, 3), 0.5)], 1).astype(np.float32)
+    points = np.concatenate([places, -places / 2, np.full((1000, 3), 0.5), np.zeros((1000, 3))], 1).astype(np.float32)
     sample = embedding.Sample(points, np.full((1000, 3), 3.0), np.full((2, 1000, 3), 7.0), points[::50], None,
-                              np.ones((20, 3)), np.zeros((20, 3)), embedding.embedding.layout(places, (2, 2), 6, 4), None, None)
+                              np.ones((20, 3)), np.zeros((20, 3)), embedding.embedding.layout(places, (2, 2), 6, 4),
+                              None, None)
     for name, give in embedding.BASELINES.items():
         expected = np.full((20, 3), 7.0 if "nearest" in name else 3.0)
         np.testing.assert_allclose(give(sample, np.arange(20)), expected, rtol=0.2, err_msg=name)

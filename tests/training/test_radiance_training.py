@@ -69,7 +69,7 @@ def test_training_asks_as_the_bake_does(cache, tiny):
     torch.nn.init.normal_(model.weigh.weight, std=0.5)
     held = held_out(cache)
     sample, rows = held.sample, radiance.held_rows(held.sample)
-    points = LitPoints(*(sample.points[:, at:at + 3] for at in (0, 3, 6)), sample.direct, sample.looks[0],
+    points = LitPoints(*(sample.points[:, at:at + 3] for at in (0, 3, 6, 9)), sample.direct, sample.looks[0],
                        held.shapes[0].astype(np.float32))
     queries = sample.queries[rows]
     _, baked = methods.run(embedding_bake.Room(tiny, points, model).reflected_from(

@@ -25,7 +25,7 @@ def test_a_file_holds_what_it_promises(tmp_path):
     for job, path in zip(jobs, paths, strict=True):
         found = load(path)
         assert [found.pop(key).shape for key in room_labels.KEYS] == [
-            (64, 9), (64, 3), (room_labels.LOOKS, 64, 3), (room_labels.LOOKS, 64, 25, 3), (48, 9), *[(48, 3)] * 4,
+            (64, 12), (64, 3), (room_labels.LOOKS, 64, 3), (room_labels.LOOKS, 64, 25, 3), (48, 9), *[(48, 3)] * 4,
             (48, 25, 3), (48, 5, 3), (), ()]
         assert not found
         found = load(path)

@@ -46,14 +46,14 @@ class Settings:
     around: int = 16                    # codes of a depthwise convolution: on a surface, those within two spacings
     patch: int = 1024                   # codes that attend to each other, at most: cost grows with M, not with M²
     neighbours: int = 16                # k of the decoder: more gain little (docs/embedding.md)
-    layers: int = 1                     # of the decoder of irradiance
+    layers: int = 0                     # of the decoder of irradiance, after the one that weighs light
     wider: int = 2                      # perceptrons within are as many times as wide as what they are added to
     dropout: float = 0.0
 
 
 SMALL = Settings(first=32, widths=(64, 64), hidden=32)
+# the paper's Table 3: depths 2, 2, 2, 6, 2 of 128, 128, 128, 256 and 256 channels
 FULL = Settings(first=128, widths=(128,) * 6 + (256,) * 8, hidden=128, neighbours=32, layers=6, wider=4, dropout=0.1)
-"""The paper's Table 3: depths 2, 2, 2, 6, 2 of 128, 128, 128, 256 and 256 channels."""
 
 
 def relation(places: Tensor, normals: Tensor, others: Tensor, other_normals: Tensor, spacing: Tensor) -> Tensor:
@@ -261,6 +261,7 @@ class Codes:
     light: Tensor   # (B, m) reflected light there, in units of the level
     key: Tensor     # (B, m, H)
     value: Tensor   # (B, m, H)
+    further: tuple[tuple[Tensor, Tensor], ...] = ()  # key and value of each layer more
 
 
 class Encoder(nn.Module):
@@ -270,26 +271,29 @@ class Encoder(nn.Module):
         super().__init__()
         width = settings.widths[-1]
         self.pool = Kernel(_SHARP)
-        self.embed = NearestNeighbourEmbedding(4, 3 * POOLS, settings)
+        self.embed = NearestNeighbourEmbedding(5, 3 * POOLS, settings)
         self.transform = PointTransformer(settings)
         self.factor, self.share = nn.Linear(width, 1), nn.Linear(width, POOLS)
         self.key, self.value = nn.Linear(width, settings.hidden), nn.Linear(width, settings.hidden)
+        self.further = nn.ModuleList(nn.Linear(width, 2 * settings.hidden) for _ in range(settings.layers))
         _silent(self.factor)
         _silent(self.share)
 
-    def forward(self, frame: Frame, albedo: Tensor, direct: Tensor, indirect: Tensor) -> Codes:
-        """albedo, direct, indirect: (B, M), the light in units of the level."""
+    def forward(self, frame: Frame, albedo: Tensor, emission: Tensor, direct: Tensor, indirect: Tensor) -> Codes:
+        """albedo, emission, direct, indirect: (B, M), the latter three in units of the level."""
         size = (frame.areas / frame.areas.mean().clamp_min(1e-30)).clamp_min(1e-3).log().expand_as(albedo)
         near, weights = frame.gathered, self.pool(frame.lie(frame.gathered)).softmax(1)  # (m, k, POOLS)
-        gathered = indirect[:, near]
-        pooled, first = (torch.einsum("bmk,mkp->bmp", light, weights)                  # (B, m, POOLS)
-                         for light in (gathered, (albedo * direct)[:, near]))
-        spread = torch.einsum("bmk,mkp->bmp", gathered.square(), weights).sub(pooled.square()).clamp_min(1e-12).sqrt()
-        x = self.embed(frame, torch.stack([size, albedo, direct.log1p(), indirect.log1p()], 2),
+        with torch.autocast(near.device.type, enabled=False):  # squares of bright light are beyond halves
+            weights, gathered = weights.float(), indirect[:, near]
+            pooled, first, squares = (torch.einsum("bmk,mkp->bmp", light, weights)      # (B, m, POOLS)
+                                      for light in (gathered, (albedo * direct)[:, near], gathered.square()))
+            spread = squares.sub(pooled.square()).clamp_min(1e-12).sqrt()
+        x = self.embed(frame, torch.stack([size, albedo, emission.log1p(), direct.log1p(), indirect.log1p()], 2),
                        torch.cat([pooled, first, spread], 2).log1p())
         x = self.transform(x, frame)
         light = (self.share(x).softmax(2) * pooled).sum(2)
-        return Codes(light * _factor(self.factor(x)), self.key(x), self.value(x))
+        further = tuple(layer(x).chunk(2, 2) for layer in self.further)
+        return Codes(light * _factor(self.factor(x)), self.key(x), self.value(x), further)
 
 
 def _factor(raw: Tensor) -> Tensor:
@@ -304,15 +308,14 @@ class Further(nn.Module):
         super().__init__()
         hidden = settings.hidden
         self.norms = nn.ModuleList(nn.LayerNorm(hidden) for _ in range(2))
-        self.asks, self.key_value = nn.Linear(hidden, hidden, bias=False), nn.Linear(hidden, 2 * hidden)
+        self.asks = nn.Linear(hidden, hidden, bias=False)
         self.lie = _perceptron(RELATION, hidden, 2 * hidden)
         self.weigh = nn.Linear(hidden, hidden, bias=False)
         self.mix = _perceptron(hidden, settings.wider * hidden, hidden)
         self.drop = nn.Dropout(settings.dropout)
 
-    def forward(self, x: Tensor, codes: Codes, lie: Tensor, near: Tensor) -> Tensor:
-        """(B, n, H) to the same; how codes near (n, k) to each query lie (n, k, RELATION)."""
-        key, value = self.key_value(codes.value).chunk(2, 2)
+    def forward(self, x: Tensor, key: Tensor, value: Tensor, lie: Tensor, near: Tensor) -> Tensor:
+        """(B, n, H) to the same. key, value: (B, m, H) of codes; those near (n, k) to queries lie (n, k, RELATION)."""
         relates, offset = self.lie(lie).chunk(2, 2)
         weights = self.weigh((key[:, near] + relates + self.asks(self.norms[0](x))[:, :, None]).relu()).softmax(2)
         x = x + self.drop((weights * (value[:, near] + offset)).sum(2))
@@ -332,7 +335,7 @@ class Decoder(nn.Module):
         self.lie = _perceptron(RELATION, hidden, 2 * hidden)
         self.asks = _perceptron(1, hidden, 2 * hidden)
         self.weigh = nn.Linear(hidden, 1 + hidden, bias=False)
-        self.further = nn.ModuleList(Further(settings) for _ in range(settings.layers - 1))
+        self.further = nn.ModuleList(Further(settings) for _ in range(settings.layers))
         self.finish = nn.Sequential(nn.LayerNorm(hidden), _silent(_perceptron(hidden, hidden, 1)))
 
     def forward(self, codes: Codes, frame: Frame, places: Tensor, normals: Tensor, direct: Tensor, near: Tensor
@@ -351,8 +354,8 @@ class Decoder(nn.Module):
         own = (weights[..., 0] + self.kernel(lie)[..., 0]).softmax(2)
         light = (own * codes.light[:, near]).sum(2)
         latent = latent + (weights[..., 1:].softmax(2) * (codes.value[:, near] + offset)).sum(2)
-        for layer in self.further:
-            latent = layer(latent, codes, lie, near)
+        for layer, (key, value) in zip(self.further, codes.further, strict=True):
+            latent = layer(latent, key, value, lie, near)
         return light * _factor(self.finish(latent))
 
 
