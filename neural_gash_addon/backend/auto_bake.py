@@ -15,9 +15,10 @@ from . import advice
 from . import spherical_harmonics as sh
 from .bands import Bands, all_of, of_open_sky
 from .geometry import TriangleMesh
+from .horizon import nothing_blocks
 from .merged import SAFE, Merged, dense, merged
 from .pilot import Pilot, look, looking
-from .plan import Plan, cheapest, nothing_blocks, traced_bands, unshadowed, unshadowed_bands
+from .plan import Plan, cheapest, traced_bands, unshadowed, unshadowed_bands
 from .progress import scaled
 from .raycast import Geometry, Occluders
 from .transfer import Transfer

@@ -16,8 +16,8 @@ from .bounce import BLACK, Reflection
 from .errors import UserError
 from .estimator import MAX_RAYS
 from .geometry import TEXEL, TriangleMesh
+from .horizon import nothing_blocks
 from .lamps import Lamps
-from .plan import nothing_blocks
 from .progress import run as run  # the callers of `bake` drive it
 from .progress import scaled
 from .raycast import Geometry, Occluders

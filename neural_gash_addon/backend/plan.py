@@ -2,7 +2,7 @@
 """The planner (`auto`): the cheapest way to get direct transfer within a tolerance, and why.
 
 1. Where everything lies below the tangent plane of every point, nothing can be blocked: unshadowed transfer is exact,
-   and neither a ray nor a scene is needed. A convex mesh is so.
+   and neither a ray nor a scene is needed (`horizon`). A convex mesh is so.
 2. Else a pilot says how large shadows are, and what rays bring and cost (`pilot`). Where the scene that it traces would
    take longer than it may, the mesh is merged first to see whether shadows are wanted at all (`merged`).
 3. Bands whose energy would not be seen are dropped (`bands`); the rest of the tolerance is for the others.
@@ -14,20 +14,13 @@ rays, which are more exact.
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-
-import numpy as np
 
 from . import bands
 from .bands import Bands
 from .embree_bake import FIRST_RAYS
-from .estimator import morton_order
-from .geometry import TriangleMesh
 from .hybrid_bake import FEWEST, expected_rays
 from .pilot import Pilot
-from .raycast import Geometry, used
-from .workers import product
 
 _SAFE = 1.1                  # what the pilot's noise may be too low by
 _MARGIN = 0.95               # of a tolerance, for who measures it: the measure is a little too low where it stops
@@ -37,9 +30,6 @@ _EMBREE_RAYS, _HYBRID_RAYS = 6.0, 10.0  # and at each point besides its rays, in
 SPARSE_POINTS = 1 << 16      # from which on a sparse bake is a candidate; below, too many are samples
 _SPARSE_SHARE = 0.15         # of the points that it then traces, about
 _SPARSE_RAYS = 25.0          # what reconstruction costs at each point, in rays
-_LEAF = 64                   # vertices of a ball that are compared with a plane at a time
-_MOST_PAIRS = 5e8            # of points and balls: what takes longer is not looked at, but traced
-_LEVEL = 1e-6                # of the extent: heights over a plane that are rounding
 
 
 @dataclass(frozen=True)
@@ -50,44 +40,6 @@ class Plan:
     rays: int | None = None          # for every point, or
     tolerance: float | None = None   # to be met by measuring
     reason: str = ""                 # one sentence
-
-
-def nothing_blocks(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> bool:
-    """Whether no triangle rises above the tangent plane of any point, so that every hemisphere is free.
-
-    False also where it would take long to say.
-    """
-    parts = [(np.asarray(p, np.float64), t) for p, t in ((mesh.positions, mesh.triangles), *occluders) if len(t)]
-    lit = mesh.lit()
-    # a handful first: almost every mesh is found out by them
-    few = np.concatenate([p[t[::len(t) // 4096 + 1, 0]] for p, t in parts])
-    level = _LEVEL * max(float(axis.max() - axis.min()) for axis in np.concatenate([p for p, _ in parts]).T)
-    chosen = lit[::len(lit) // 32 + 1]
-    height = mesh.normals[chosen]
-    if (product(height, few.T).max(1, initial=-np.inf) > (height * mesh.points[chosen]).sum(1) + level).any():
-        return False
-    vertices = np.concatenate([p[used(p, t)] for p, t in parts])
-    level = _LEVEL * max(float(np.ptp(axis)) for axis in vertices.T)
-    points, normals = mesh.points[lit], mesh.normals[lit]
-    vertices = vertices[morton_order(vertices)]
-    balls = -(-len(vertices) // _LEAF)
-    if len(points) * balls > _MOST_PAIRS:
-        return False
-    vertices = np.concatenate([vertices, np.repeat(vertices[-1:], balls * _LEAF - len(vertices), 0)])
-    leaves = vertices.reshape(balls, _LEAF, 3)
-    centres = leaves.mean(1)
-    radii = np.linalg.norm(leaves - centres[:, None], axis=2).max(1)
-    step = max(1, (1 << 20) // balls)
-    for start in range(0, len(points), step):
-        here = slice(start, start + step)
-        plane = (normals[here] * points[here]).sum(1) + level
-        one, ball = np.nonzero(product(normals[here], centres.T) + radii > plane[:, None])
-        for first in range(0, len(one), 1 << 14):
-            part = slice(first, first + (1 << 14))
-            reach = np.einsum("pvx,px->pv", leaves[ball[part]], normals[here][one[part]]).max(1)
-            if (reach > plane[one[part]]).any():
-                return False
-    return True
 
 
 def unshadowed_bands(found: Pilot, order: int, tolerance: float, safe: float = 1.0) -> tuple[Plan, Bands] | None:

@@ -10,7 +10,7 @@ from neural_gash_addon.backend.geometry import TriangleMesh
 from neural_gash_addon.backend.pilot import Pilot
 from neural_gash_addon.backend.record import BakeRecord
 
-from .shapes import cube, grid, sphere, torus
+from .shapes import cube, sphere, torus
 
 
 def bake(mesh, **arguments):
@@ -20,32 +20,6 @@ def bake(mesh, **arguments):
 def seen(blocked, noise):
     """What a pilot may have seen, with 64 rays."""
     return Pilot(blocked, 1.2 * blocked, noise, rays=64, scale=1.0, ray=1e-7, traced=1, sample=())
-
-
-def slowly(mesh, occluders=()):
-    """`nothing_blocks`, every vertex against every plane."""
-    parts = [(mesh.positions, mesh.triangles), *occluders]
-    vertices = np.concatenate([p[np.unique(t)] for p, t in parts])
-    size = np.ptp(vertices, axis=0).max()
-    return not any(((vertices - p) @ n > 1e-6 * size).any() for p, n in zip(mesh.points, mesh.normals, strict=True))
-
-
-@pytest.mark.parametrize("name", ["sphere", "cube", "torus", "grid", "dented", "shaded"])
-def test_what_blocks_is_found_as_a_plain_loop_finds_it(name):
-    positions, triangles = {"torus": torus(), "grid": grid(), "cube": cube(subdivisions=3)}.get(name, sphere(4))
-    if name == "dented":  # one vertex of 2562, which the handful looked at first may well miss
-        positions[1234] *= 0.98
-    mesh = TriangleMesh.from_triangles(positions, triangles, smooth=name not in ("cube", "shaded"))
-    assert plan.nothing_blocks(mesh, []) == slowly(mesh)
-    assert plan.nothing_blocks(mesh, []) == (name in ("sphere", "cube", "grid", "shaded"))
-
-
-def test_other_objects_block_only_above_the_horizon():
-    mesh = TriangleMesh.from_triangles(*grid())
-    ball = sphere(2)
-    below, above = (ball[0] - [0, 0, 2], ball[1]), (ball[0] + [0, 0, 2], ball[1])
-    assert plan.nothing_blocks(mesh, [below])
-    assert not plan.nothing_blocks(mesh, [below, above])
 
 
 def test_a_convex_mesh_traces_no_ray():
