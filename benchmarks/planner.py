@@ -2,12 +2,12 @@
 """The planner's regret: time of its plan over that of the cheapest candidate that meets the tolerance; `make planner`.
 
 Every candidate is run on every mesh of ../shared/meshes/validation (or --folder), on one thread, and timed by the
-processor, which other work on the machine disturbs least: unshadowed, plain bakes of 4 to 48 rays, the networks that
-a plan never picks (gnn, embedding), and the three methods that measure (ray traced, hybrid, sparse) to the tolerance. A candidate meets it whose error (at most 2,000 of
-the points) is no more. The error is the product of the differences from two references of 2,048 rays with seeds of
-their own: so their noise, which a single one would add to what is measured, cancels. The planner's own time has
-everything in it: its pilot, its looks for what blocks and inside faces. A pilot may cost 50 ms or a tenth of the plan:
-the second regret leaves out so much of these.
+processor, which other work on the machine disturbs least: unshadowed, plain bakes of 4 to 48 rays, the networks that a
+plan never picks (gnn, embedding), and the three methods that measure (ray traced, hybrid, sparse) to the tolerance. A
+candidate meets it whose error (at most 2,000 of the points) is no more. The error is the product of the differences
+from two references of 2,048 rays with seeds of their own: so their noise, which a single one would add to what is
+measured, cancels. The planner's own time has everything in it: its pilot, its looks for what blocks and inside faces. A
+pilot may cost 50 ms or a tenth of the plan: the second regret leaves out so much of these.
 
 With --bands: the planner beside itself when it is held to bake all bands of --order, instead of the candidates; errors
 are those over all these bands.
@@ -35,8 +35,8 @@ from neural_gash_addon.backend.transfer import Transfer
 
 TOLERANCES = (0.2, 0.1, 0.05, 0.02, 0.01)
 REFERENCE_RAYS, POINTS = 2048, 2000
-FIXED: list[tuple[str, dict]] = [("analytic", {}), *(("embree", {"rays": rays}) for rays in (4, 6, 8, 12, 16, 24, 32, 48)),
-                                 ("gnn", {}), ("embedding", {})]
+FIXED: list[tuple[str, dict]] = [
+    ("analytic", {}), *(("embree", {"rays": rays}) for rays in (4, 6, 8, 12, 16, 24, 32, 48)), ("gnn", {}), ("embedding", {})]
 MEASURING = ("embree", "hybrid", "sparse")
 FEW_POINTS = 4 * sparse_bake.FEWEST  # with less, a sparse bake is a ray-traced one
 QUICK, QUICK_RUNS = 0.1, 5  # seconds of all runs
