@@ -36,7 +36,8 @@ from neural_gash_addon.backend.transfer import Transfer
 TOLERANCES = (0.2, 0.1, 0.05, 0.02, 0.01)
 REFERENCE_RAYS, POINTS = 2048, 2000
 FIXED: list[tuple[str, dict]] = [
-    ("analytic", {}), *(("embree", {"rays": rays}) for rays in (4, 6, 8, 12, 16, 24, 32, 48)), ("gnn", {}), ("embedding", {})]
+    ("analytic", {}), *(("embree", {"rays": rays}) for rays in (4, 6, 8, 12, 16, 24, 32, 48)), ("gnn", {}),
+    ("embedding", {})]
 MEASURING = ("embree", "hybrid", "sparse")
 FEW_POINTS = 4 * sparse_bake.FEWEST  # with less, a sparse bake is a ray-traced one
 QUICK, QUICK_RUNS = 0.1, 5  # seconds of all runs
