@@ -3,7 +3,8 @@
 
 `python benchmarks/embedding_pictures.py --rooms 4 --out docs`: a table, and embedding_rooms.png. From the left: 64
 paths a pixel, as many as the network's time allows, the network, the reference. One thread, processor seconds; the
-network's include sampling and lighting the scene points, encoding, tracing direct light and decoding.
+network's are of a whole bake: sampling and lighting the scene points, encoding, tracing direct light and what lies in
+gaps, decoding, and measuring the error.
 """
 from __future__ import annotations
 
@@ -58,7 +59,7 @@ def main() -> None:
     from matplotlib.image import imsave
 
     torch.set_num_threads(1)
-    model = embedding_bake.network()
+    sizes = embedding_bake.network().settings
     strips, sums = [], {}
     print("| room | light | s | MSE | SSIM | rel. MSE |\n|---|---|---|---|---|---|")
     for job in room_labels.evaluation(arguments.rooms, None, REFERENCE):
@@ -74,16 +75,16 @@ def main() -> None:
             return methods.run(irradiance.irradiance(scene, places, normals, rays, seed=start, threads=1,
                                                      occluders=occluders, **how)).values
 
-        def asked(scene=scene, places=places, normals=normals, occluders=occluders, traced=traced) -> NDArray:
-            direct = traced(STRAIGHT, 4, depth=1)
-            room = embedding_bake.Room(model, methods.run(lit_points(scene, occluders, threads=1)))
-            return direct + methods.run(room.reflected(places, normals, direct))
+        def asked(scene=scene, places=places, normals=normals, occluders=occluders) -> NDArray:
+            return methods.run(embedding_bake.irradiance(scene, places, normals, seed=4, threads=1,
+                                                         occluders=occluders)).values
 
         def untrained(seen=seen, places=places, scene=scene, occluders=occluders, traced=traced) -> dict[str, NDArray]:
             points, direct = methods.run(lit_points(scene, occluders, threads=1)), traced(STRAIGHT, 4, depth=1)
             every = np.concatenate([points.places, points.normals, points.albedo, points.emission], 1)
             sample = judging.Sample(every, points.direct, points.indirect[None], seen.queries, None, None, None,
-                                    embedding.layout(points.places, (2, 2), 32, 16), None, None)
+                                    embedding.layout(points.places, sizes.halvings, sizes.gathered, sizes.around), None,
+                                    None)
             return {name: direct + give(sample, np.arange(len(places))) for name, give in judging.BASELINES.items()}
 
         truth = traced(arguments.reference, 1)
