@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 
-PEERS = ("numpy", "embreex", "trimesh", "open3d-cpu", "mitsuba", "libigl", "bpy")
+PEERS = ("numpy", "embreex", "torch", "trimesh", "open3d-cpu", "mitsuba", "libigl", "bpy")
 
 
 def seconds(work: Callable[[], object]) -> float:

@@ -18,7 +18,7 @@ from .geometry import TriangleMesh
 from .horizon import nothing_blocks
 from .merged import SAFE, Merged, dense, merged
 from .pilot import Pilot, look, looking
-from .plan import Plan, cheapest, traced_bands, unshadowed, unshadowed_bands
+from .plan import Plan, Way, Ways, cheapest, traced_bands, unshadowed, unshadowed_bands
 from .progress import scaled
 from .raycast import Geometry, Occluders
 from .transfer import Transfer
@@ -27,6 +27,15 @@ from .workers import default_threads, workers
 _PILOT_SHARE = 0.05  # of the progress
 _ROUGH = 0.05    # a tolerance that a look at a merged mesh, with the rays of twice that, is exact enough for
 _MANY = 1 << 18  # points that are baked at a time, where those that are looked at are but some of them
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A method that a plan may name."""
+
+    bake: Callable[..., Generator[float, None, Transfer]]
+    traces: bool          # takes rays or a tolerance, the scene and the pilot, and measures its error
+    ways: Way | None      # None: where nothing is traced
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,24 +51,37 @@ class Planned:
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None, occluders: Sequence[Geometry],
          seed: int, threads: int | None, scene: Occluders | None = None, whole: bool = False,
-         bakers: Mapping[str, Callable[..., Generator[float, None, Transfer]]],
-         ) -> Generator[float, None, Transfer]:
+         candidates: Mapping[str, Candidate]) -> Generator[float, None, Transfer]:
     """Bake as cheaply as the tolerance allows; arguments as `methods.bake`.
 
-    bakers: the methods that a plan may name. With a number of rays there is nothing to plan but whether any is needed.
+    candidates: by name. With a number of rays there is nothing to plan but whether any is needed. What a method without
+    rays gives is compared with the pilot, and traced where it is not within the tolerance.
     """
     began = time.perf_counter()
-    planning = planned(mesh, order, rays, tolerance, occluders, seed, threads, scene, whole)
+    planning = planned(mesh, order, rays, tolerance, occluders, seed, threads, scene, whole,
+                       [each.ways for each in candidates.values() if each.ways])
     found = yield from scaled(planning, 0, _PILOT_SHARE)
     plan, pilot, order = found.plan, found.pilot, found.bands.order
-    known = {"pilot": pilot} if plan.method != "analytic" else {}
-    work = bakers[plan.method](mesh, order, rays=plan.rays, tolerance=plan.tolerance, occluders=occluders, seed=seed,
-                               threads=threads, scene=found.scene, **known)
-    transfer = yield from scaled(work, _PILOT_SHARE, 1 - _PILOT_SHARE)
-    record = replace(transfer.record, plan=plan.reason).also(found.bands.reason).also(advice.domain(mesh))
-    error, probes = record.error_estimate, record.probe_rays
+
+    def work(plan: Plan) -> Generator[float, None, Transfer]:
+        known = {"scene": found.scene, "pilot": pilot} if candidates[plan.method].traces else {}
+        return candidates[plan.method].bake(mesh, order, rays=plan.rays, tolerance=plan.tolerance, occluders=occluders,
+                                            seed=seed, threads=threads, **known)
+
+    transfer = yield from scaled(work(plan), _PILOT_SHARE, 1 - _PILOT_SHARE)
+    error = transfer.record.error_estimate
     if plan.method == "analytic":
         error = pilot.blocked if pilot is not None else 0.0
+    elif pilot is not None and tolerance is not None and not candidates[plan.method].traces:
+        error = pilot.error_of(transfer.coefficients)
+        left = tolerance if whole else found.bands.left
+        if error > left:
+            plan = cheapest(pilot, len(mesh.points), left, [each.ways for each in candidates.values()
+                                                            if each.traces and each.ways], tolerance)
+            transfer = yield from scaled(work(plan), _PILOT_SHARE, 1 - _PILOT_SHARE)
+            error = transfer.record.error_estimate
+    record = replace(transfer.record, plan=plan.reason).also(found.bands.reason).also(advice.domain(mesh))
+    probes = record.probe_rays
     if pilot is not None and tolerance is not None:
         seen, scene, corners = mesh, found.scene, transfer.coefficients
         if found.merged:
@@ -78,9 +100,9 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
 
 
 def planned(mesh: TriangleMesh, order: int, rays: int | None, tolerance: float | None, occluders: Sequence[Geometry],
-            seed: int, threads: int | None, scene: Occluders | None, whole: bool = False
+            seed: int, threads: int | None, scene: Occluders | None, whole: bool, ways: Ways
             ) -> Generator[float, None, Planned]:
-    """Look, and choose; arguments as `methods.bake`. Yields progress."""
+    """Look, and choose among the ways; other arguments as `methods.bake`. Yields progress."""
     every = all_of(order, tolerance)
     if nothing_blocks(mesh, occluders):
         return Planned(Plan("analytic", reason="Nothing rises above any point's horizon: unshadowed is exact."), scene,
@@ -97,7 +119,9 @@ def planned(mesh: TriangleMesh, order: int, rays: int | None, tolerance: float |
         return (plan, every) if plan else None
 
     def with_rays(found: Pilot) -> tuple[Plan, Bands]:
-        return (cheapest(found, points, enough), every) if whole else traced_bands(found, points, order, enough)
+        if whole:
+            return cheapest(found, points, enough, ways), every
+        return traced_bands(found, points, order, enough, ways)
 
     with workers(threads, looking(points, tolerance)) as pool:
         few = merged(mesh, occluders) if scene is None and tolerance >= _ROUGH and dense(mesh, occluders) else None
@@ -113,14 +137,14 @@ def planned(mesh: TriangleMesh, order: int, rays: int | None, tolerance: float |
 
 
 def enough_bands(mesh: TriangleMesh, order: int, tolerance: float, occluders: Sequence[Geometry], seed: int,
-                 threads: int | None, scene: Occluders) -> Generator[float, None, Bands]:
+                 threads: int | None, scene: Occluders, ways: Ways) -> Generator[float, None, Bands]:
     """The fewest bands that are enough where the points of a mesh are but some of many, which are baked in parts.
 
-    Arguments as `methods.bake`. Yields progress.
+    Arguments as `planned`. Yields progress.
     """
     if nothing_blocks(mesh, occluders):
         return of_open_sky(order, tolerance)
     threads = threads or default_threads()
     with workers(threads, looking(len(mesh.points), tolerance)) as pool:
         pilot = yield from look(mesh, scene, order, tolerance, seed, pool, threads)
-    return traced_bands(pilot, _MANY, order, tolerance)[1]
+    return traced_bands(pilot, _MANY, order, tolerance, ways)[1]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from . import auto_bake, embree_bake, gnn_bake, hybrid_bake, paper_bake, sky_bake, sparse_bake
+from . import auto_bake, embree_bake, gnn_bake, hybrid_bake, paper_bake, plan, sky_bake, sparse_bake
 from . import spherical_harmonics as sh
 from .bounce import BLACK, Reflection
 from .errors import UserError
@@ -42,6 +42,7 @@ class Method:
     # what makes of a mesh and its occluders what the method sees of them; None: it sees no shadows
     sees: Callable[[TriangleMesh, Sequence[Geometry]], Any] | None = None
     plans: bool = False  # to a tolerance, the order is the most that it bakes
+    ways: plan.Way | None = None  # by what a pilot saw, what it could do within a tolerance: a plan may then take it
     reflects: bool = False  # takes a `reflection`, and follows bounces itself
 
     @property
@@ -69,27 +70,35 @@ def _embree_scene(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> Occluder
 
 
 def _auto(mesh: TriangleMesh, order: int, **arguments: Any) -> Baking:
-    return auto_bake.bake(mesh, order, **arguments, bakers={name: METHODS[name].bake for name in
-                                                            ("analytic", "embree", "hybrid", "sparse")})
+    return auto_bake.bake(mesh, order, **arguments, candidates={
+        name: auto_bake.Candidate(entry.bake, entry.traces, entry.ways) for name, entry in METHODS.items()
+        if entry.ways or name == "analytic"})
+
+
+def ways() -> list[plan.Way]:
+    """What a plan chooses among."""
+    return [entry.ways for entry in METHODS.values() if entry.ways]
 
 
 METHODS: dict[str, Method] = {m.name: m for m in (
     Method("analytic", "Unshadowed", "Exact shading of the normals alone, without any shadows; instant",
            traces=False, bake=_analytic),
     Method("embree", "Ray traced", "Traces rays with Embree to find what blocks the light; the reference",
-           traces=True, bake=embree_bake.bake, sees=_embree_scene),
+           traces=True, bake=embree_bake.bake, sees=_embree_scene, ways=plan.embree_ways),
     Method("auto", "Automatic", "Looks at a few points, and takes the cheapest method, and the fewest bands, that meet "
            "the tolerance",
            traces=True, bake=_auto, sees=_embree_scene, plans=True),
     Method("hybrid", "Few rays and network", "Traces few rays, and a small network takes the rest from neighbours: "
-           "smooth at once, and exact with many rays", traces=True, bake=hybrid_bake.bake, sees=_embree_scene),
+           "smooth at once, and exact with many rays", traces=True, bake=hybrid_bake.bake, sees=_embree_scene,
+           ways=plan.hybrid_ways),
     Method("sparse", "Ray traced, sparse", "Traces some points, more where shadows change, and reads the others off "
-           "them; for dense meshes", traces=True, bake=sparse_bake.bake, sees=_embree_scene),
+           "them; for dense meshes", traces=True, bake=sparse_bake.bake, sees=_embree_scene,
+           ways=plan.sparse_ways),
     Method("gnn", "Network", "A network reads the surface around each point, with no ray: soft shadows, quickly",
-           traces=False, bake=gnn_bake.bake, sees=gnn_bake.voxels_of),
+           traces=False, bake=gnn_bake.bake, sees=gnn_bake.voxels_of, ways=plan.gnn_ways),
     Method("embedding", "Embedding (PyTorch)", "Traces rays at some thousand points of the surface, and a network says "
            "from them what blocks the light anywhere; what a point costs does not grow with the scene", traces=False,
-           bake=sky_bake.bake, sees=sky_bake.encoded, reflects=True),
+           bake=sky_bake.bake, sees=sky_bake.encoded, reflects=True, ways=plan.embedding_ways),
     Method("gnn-paper", "Paper's network (PyTorch)", "The two-stage graph network of Neural-GASh, for comparison: "
            "no rays; soft shadows of the mesh on itself", traces=False, bake=paper_bake.bake_gnn),
     Method("gnn-paper-ao", "Paper's network with AO (PyTorch)", "The same, darkened where neighbours stand above the "

@@ -70,6 +70,13 @@ class Pilot:
         _, one, two = self.sample
         return (self.unshadowed - one) * (self.unshadowed - two), one * two
 
+    def error_of(self, coefficients: NDArray) -> float:
+        """The relative error of transfer (N, K) of all points, by these."""
+        points, one, two = self.sample
+        blocked = self.unshadowed - coefficients[points]
+        energy = float(self._energies()[0].sum())
+        return float(max(((blocked - one) * (blocked - two)).sum(), 0.0) / energy) ** 0.5 if energy > 0 else np.inf
+
     def noise_of(self, rays: float) -> float:
         """The relative error of a plain bake with so many rays."""
         uneven = _UNEVEN if np.log2(rays) % 1 else 1.0

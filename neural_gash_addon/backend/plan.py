@@ -9,11 +9,13 @@
 4. Each candidate is given a number of rays that meets the tolerance, and a time; the cheapest is taken. What the noise
    becomes with other rays, and what a hybrid or a sparse bake saves, follow laws measured on meshes (below).
 
-`gnn` is no candidate: what it saves is the scene, which the pilot has built, and at each point it costs as much as 100
-rays, which are more exact.
+`gnn` and `embedding` are candidates that win nowhere that was looked at: what the former saves is the scene, which the
+pilot has built, and at each point it costs as much as 100 rays, which are more exact; the latter costs more than that.
 """
 from __future__ import annotations
 
+import importlib.util
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from . import bands
@@ -30,6 +32,9 @@ _EMBREE_RAYS, _HYBRID_RAYS = 6.0, 10.0  # and at each point besides its rays, in
 SPARSE_POINTS = 1 << 16      # from which on a sparse bake is a candidate; below, too many are samples
 _SPARSE_SHARE = 0.15         # of the points that it then traces, about
 _SPARSE_RAYS = 25.0          # what reconstruction costs at each point, in rays
+_GNN_RAYS, _EMBEDDING_RAYS = 100.0, 120.0  # what networks cost at each point, in rays,
+_EMBEDDING_SECONDS = 0.3     # and for its scene points;
+_GNN_LEFT, _EMBEDDING_LEFT = 0.4, 0.4  # their error as a part of shadows: the root of the SRR of their worst meshes
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,12 @@ class Plan:
     rays: int | None = None          # for every point, or
     tolerance: float | None = None   # to be met by measuring
     reason: str = ""                 # one sentence
+    seconds: float = 0.0             # expected
+
+
+# of what a pilot saw, of how many points, with which tolerance, and how that is called: what could be done
+Way = Callable[[Pilot, int, float, str], list[Plan]]
+Ways = Iterable[Way]
 
 
 def unshadowed_bands(found: Pilot, order: int, tolerance: float, safe: float = 1.0) -> tuple[Plan, Bands] | None:
@@ -53,19 +64,19 @@ def unshadowed_bands(found: Pilot, order: int, tolerance: float, safe: float = 1
     return None
 
 
-def traced_bands(found: Pilot, points: int, order: int, tolerance: float) -> tuple[Plan, Bands]:
-    """The cheapest plan for so many points that meets the tolerance (relative L2) by tracing, and its bands.
+def traced_bands(found: Pilot, points: int, order: int, tolerance: float, ways: Ways) -> tuple[Plan, Bands]:
+    """The cheapest plan for so many points that meets the tolerance (relative L2) by one of the ways, and its bands.
 
     These are the fewest of the order that take no more time than all. Noise goes with the bands, so that the others
     mostly need fewer rays, though less of the tolerance is left for them.
     """
     parts = _parts(found, order)
-    every = cheapest(found, points, tolerance)
+    every = cheapest(found, points, tolerance, ways)
     for fewer in range(bands.LEAST_ORDER, order):
         if parts[fewer][1] <= bands.MOST_DROPPED * tolerance:
-            enough, cut = bands.chosen(fewer, order, tolerance, parts), found.to_order(fewer)
-            plan = cheapest(cut, points, enough.left, tolerance)
-            if seconds(plan, cut, points) <= seconds(every, found, points):
+            enough = bands.chosen(fewer, order, tolerance, parts)
+            plan = cheapest(found.to_order(fewer), points, enough.left, ways, tolerance)
+            if plan.seconds <= every.seconds:
                 return plan, enough
     return every, bands.chosen(order, order, tolerance, parts)
 
@@ -79,10 +90,10 @@ def unshadowed(found: Pilot, tolerance: float, safe: float = 1.0) -> Plan | None
     return _unshadowed(found) if safe * found.most_blocked <= tolerance else None
 
 
-def cheapest(found: Pilot, points: int, tolerance: float, asked: float | None = None) -> Plan:
-    """The cheapest that traces; the tolerance is what is left of another, if one was asked for."""
-    candidates = [(seconds(plan, found, points), plan) for plan in plans(found, points, tolerance, asked)]
-    return min(candidates, key=lambda candidate: candidate[0])[1]
+def cheapest(found: Pilot, points: int, tolerance: float, ways: Ways, asked: float | None = None) -> Plan:
+    """The cheapest of all ways; the tolerance is what is left of another, if one was asked for."""
+    return min((plan for way in ways for plan in way(found, points, tolerance, _percent(asked or tolerance))),
+               key=lambda plan: plan.seconds)
 
 
 def _unshadowed(found: Pilot) -> Plan:
@@ -90,37 +101,54 @@ def _unshadowed(found: Pilot) -> Plan:
                                    "none is traced.")
 
 
-def plans(found: Pilot, points: int, tolerance: float, asked: float | None = None) -> list[Plan]:
-    """Every plan that is expected to meet the tolerance by tracing; people read of what was `asked`."""
-    measured, said = _MARGIN * tolerance, _percent(asked or tolerance)
-    out = [Plan("embree", tolerance=measured, reason="Rays from every point, more where shadows are harder, are the "
-                                                      f"quickest way to {said}.")]
-    enough = [rays for rays in _FEW_RAYS if _SAFE * found.noise_of(rays) <= tolerance]
+# The ways: what a method could do within a tolerance, and what that is expected to take (the scene aside, which all
+# that trace have alike). A method of the table (`methods.Method.ways`) is a candidate by these.
+
+def embree_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[Plan]:
+    """Rays until the tolerance is met, or so many as are enough."""
+    def seconds(rays: float) -> float:
+        return _EMBREE_SECONDS + found.ray * points * (rays + _EMBREE_RAYS)
+
+    measured = _MARGIN * tolerance
+    out = [Plan("embree", tolerance=measured, seconds=seconds(max(found.needed_rays(measured), 2.0 * FIRST_RAYS)),
+                reason=f"Rays from every point, more where shadows are harder, are the quickest way to {said}.")]
+    enough = next((rays for rays in _FEW_RAYS if _SAFE * found.noise_of(rays) <= tolerance), None)
     if enough:
-        out.append(Plan("embree", rays=enough[0], reason=f"Shadows are {_percent(found.blocked)} of the whole, so "
-                        f"{enough[0]} rays a point are enough for {said}."))
-    if points >= FEWEST:  # with fewer it asks no network, and what it does without takes longer than plain rays
-        out.append(Plan("hybrid", tolerance=tolerance, reason="Few rays, averaged over neighbours by the network, are "
-                                                              f"the quickest way to {said}."))
-    if points >= SPARSE_POINTS:
-        out.append(Plan("sparse", tolerance=measured, reason=f"{points:,} points are dense: some are traced, and the "
-                                                              "others read off them."))
+        out.append(Plan("embree", rays=enough, seconds=seconds(enough),
+                        reason=f"Shadows are {_percent(found.blocked)} of the whole, so {enough} rays a point are "
+                               f"enough for {said}."))
     return out
 
 
-def seconds(plan: Plan, found: Pilot, points: int) -> float:
-    """What a plan is expected to take, the scene aside, which all have alike."""
-    if plan.method == "analytic":
-        return 0.0
-    assert plan.rays is not None or plan.tolerance is not None
-    if plan.method == "embree":
-        rays = plan.rays or max(found.needed_rays(plan.tolerance or 1.0), 2.0 * FIRST_RAYS)
-        return _EMBREE_SECONDS + found.ray * points * (rays + _EMBREE_RAYS)
-    if plan.method == "hybrid":
-        rays = expected_rays(found, plan.tolerance or 1.0)
-        return _HYBRID_SECONDS + found.ray * points * (rays + _HYBRID_RAYS)
-    rays = max(found.needed_rays(plan.tolerance or 1.0), 8.0)
-    return found.ray * points * (_SPARSE_RAYS + _SPARSE_SHARE * rays)
+def hybrid_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[Plan]:
+    """Few rays; of few points it asks no network, and what it does without takes longer than plain rays."""
+    seconds = _HYBRID_SECONDS + found.ray * points * (expected_rays(found, tolerance) + _HYBRID_RAYS)
+    return [] if points < FEWEST else [Plan(
+        "hybrid", tolerance=tolerance, seconds=seconds,
+        reason=f"Few rays, averaged over neighbours by the network, are the quickest way to {said}.")]
+
+
+def sparse_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[Plan]:
+    """Some of many points."""
+    measured = _MARGIN * tolerance
+    seconds = found.ray * points * (_SPARSE_RAYS + _SPARSE_SHARE * max(found.needed_rays(measured), 8.0))
+    return [] if points < SPARSE_POINTS else [Plan(
+        "sparse", tolerance=measured, seconds=seconds,
+        reason=f"{points:,} points are dense: some are traced, and the others read off them.")]
+
+
+def gnn_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[Plan]:
+    """The network alone, where its usual error is within the tolerance; what it is here is measured afterwards."""
+    return [] if _GNN_LEFT * found.blocked > tolerance else [Plan(
+        "gnn", seconds=found.ray * points * _GNN_RAYS, reason=f"The network alone is the quickest way to {said}.")]
+
+
+def embedding_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[Plan]:
+    """Rays from scene points alone, if there is PyTorch, as `gnn_ways`."""
+    if _EMBEDDING_LEFT * found.blocked > tolerance or importlib.util.find_spec("torch") is None:
+        return []
+    return [Plan("embedding", seconds=_EMBEDDING_SECONDS + found.ray * points * _EMBEDDING_RAYS,
+                 reason=f"Rays from some points, read by the embedding anywhere, are the quickest way to {said}.")]
 
 
 def _percent(part: float) -> str:

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The planner: what it finds without rays, what it picks and says, and that it keeps to the tolerance."""
+import importlib.util
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +12,7 @@ from neural_gash_addon.backend.errors import UserError
 from neural_gash_addon.backend.geometry import TriangleMesh
 from neural_gash_addon.backend.pilot import Pilot
 from neural_gash_addon.backend.record import BakeRecord
+from neural_gash_addon.backend.transfer import Transfer
 
 from .shapes import cube, sphere, torus
 
@@ -69,10 +73,61 @@ def test_looser_tolerances_never_cost_more_and_the_cheapest_is_taken():
     for points in (500, 20_000, 1_000_000):
         before = 0.0
         for tolerance in (0.2, 0.1, 0.05, 0.02, 0.01):
-            every = [plan.seconds(p, found, points) for p in plan.plans(found, points, tolerance)]
-            chosen = plan.seconds(plan.cheapest(found, points, tolerance), found, points)
-            assert chosen == min(every) and chosen >= before
-            before = chosen
+            every = [each for way in methods.ways() for each in way(found, points, tolerance, "")]
+            chosen = plan.cheapest(found, points, tolerance, methods.ways())
+            assert chosen.seconds == min(each.seconds for each in every) and chosen.seconds >= before
+            before = chosen.seconds
+
+
+def test_every_method_of_the_table_that_says_what_it_could_do_is_a_candidate(monkeypatch):
+    """One that is added, too; where its answer is not within the tolerance, which the pilot tells, rays are traced."""
+    mesh = TriangleMesh.from_triangles(*torus(sections=64))
+    wrong = []
+
+    def later(mesh, order, **how):
+        found = yield from methods.METHODS["embree"].bake(mesh, order, rays=512, tolerance=None, occluders=[], seed=4,
+                                                          threads=1)
+        coefficients = found.coefficients * np.float32(1.1 if wrong else 1)
+        return Transfer(coefficients, replace(found.record, method="later", error_estimate=None))
+
+    method = methods.Method("later", "Later", "Added", traces=False, bake=later,
+                            ways=lambda found, points, tolerance, said: [plan.Plan("later", reason=f"To {said}.")])
+    monkeypatch.setitem(methods.METHODS, "later", method)
+    found = bake(mesh, method="auto", tolerance=0.05)
+    assert found.record.method == "later" and found.record.plan.startswith("To 5 %.")
+    assert 0 <= found.record.error_estimate < 0.03 and found.record.probe_rays > 0
+    wrong.append(True)
+    found = bake(mesh, method="auto", tolerance=0.05)
+    assert found.record.method != "later" and 0 < found.record.error_estimate <= 0.05
+    reference = bake(mesh, method="embree", rays=2048, seed=9).coefficients
+    assert metrics.rel_l2(found.coefficients, reference) <= 0.06
+
+
+def test_networks_are_candidates_where_their_usual_error_is_within_the_tolerance(monkeypatch):
+    ways = {name: methods.METHODS[name].ways for name in ("gnn", "embedding")}
+    if ways and importlib.util.find_spec("torch"):
+        assert [each.method for each in ways["embedding"](seen(0.2, 0.03), 10_000, 0.1, "10 %")] == ["embedding"]
+    assert [each.method for each in ways["gnn"](seen(0.2, 0.03), 10_000, 0.1, "10 %")] == ["gnn"]
+    for way in ways.values():
+        assert not way(seen(0.5, 0.03), 10_000, 0.1, "10 %")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert not ways["embedding"](seen(0.2, 0.03), 10_000, 0.1, "10 %")
+    assert ways["gnn"](seen(0.2, 0.03), 10_000, 0.1, "10 %")
+
+
+@pytest.mark.parametrize("name", ["gnn", "embedding"])
+def test_a_network_that_were_the_cheapest_is_asked_and_measured(name, monkeypatch):
+    if name == "embedding":
+        pytest.importorskip("torch")
+    free = plan.Plan(name, reason="Free.")
+    monkeypatch.setitem(methods.METHODS, name, replace(methods.METHODS[name], ways=lambda *_: [free]))
+    mesh = TriangleMesh.from_triangles(*torus(sections=64))
+    found = bake(mesh, method="auto", tolerance=0.2)
+    direct = bake(mesh, method=name)
+    assert found.record.method == name and found.record.plan.startswith("Free.")
+    np.testing.assert_array_equal(found.coefficients, direct.coefficients)
+    reference = bake(mesh, method="embree", rays=2048, seed=9).coefficients
+    assert found.record.error_estimate == pytest.approx(metrics.rel_l2(found.coefficients, reference), rel=0.5)
 
 
 def test_shadows_below_the_tolerance_are_not_traced():
