@@ -111,6 +111,7 @@ def test_normals_that_lean_too_far_are_found_on_a_convex_mesh():
     unlit = mesh.normals.copy()
     unlit[1235] = 0
     assert nothing_blocks(replace(mesh, normals=unlit), [])
+    assert nothing_blocks(replace(mesh, normals=0 * unlit), [])
 
 
 def test_other_objects_block_only_above_the_horizon():
