@@ -166,17 +166,17 @@ def table(cells: Sequence[Cell]) -> str:
     by = {(cell.trial, cell.method): cell for cell in cells}
     group = ""
     for trial in dict.fromkeys(cell.trial for cell in cells):
-        first = next(cell.group for cell in cells if cell.trial == trial)
-        if first != group:
-            group = first
+        own = [by.get((trial, name)) for name in names]
+        of = next(cell.group for cell in own if cell)
+        if of != group:
+            group = of
             lines.append(f"| **{group}** |" + " |" * len(names))
-        lines.append(f"| {trial.replace('_', ' ')} | " + " | ".join(_cell(by.get((trial, name))) for name in names) + " |")
+        lines.append(f"| {trial.replace('_', ' ')} | " + " | ".join("" if cell is None else _cell(cell) for cell in own)
+                     + " |")
     return "\n".join(lines)
 
 
-def _cell(cell: Cell | None) -> str:
-    if cell is None:
-        return ""
+def _cell(cell: Cell) -> str:
     if cell.refused:
         return "refused"
     mark = "🔴 " if cell.red else ""
@@ -221,7 +221,7 @@ def _missing(rows: Sequence[dict], chosen: Sequence[Setting]) -> list[Setting]:
 
 
 def _with(part: dict[str, Any] | None, name: str, rows: list[dict]) -> dict[str, Any]:
-    """A part of the results with rows added, in the order of the table of methods, each with the commit that it is of."""
+    """A part of the results with rows added, each with its commit, in the order of the table of methods."""
     now = about()
     commit = now.pop("commit")
     whole = [*(part or {}).get(name, []), *({**row, "commit": commit} for row in rows)]
