@@ -3,7 +3,7 @@
 
 A cell has the typical error (RMS over points, median over the disturbed cases), the worst of any point, and the largest
 ratio of a case's RMS to that of the same mesh undisturbed. Methods that are in the file of numbers already are not
-tried again (but that of --again is); remove it to start afresh.
+tried again (but that of --again is); remove it to start afresh. --only noise and --only rooms are of those parts alone.
 """
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -27,13 +28,17 @@ from page import fill
 from tqdm import tqdm
 from trial import FULL, ORDER, REFERENCE_SEED, SMALL, Pairs, Scale, Variant, undisturbed
 
-from neural_gash_addon.backend import compare, methods, metrics
+from neural_gash_addon.backend import compare, methods, metrics, sparse_bake
 from neural_gash_addon.backend.compare import Setting
 from neural_gash_addon.backend.errors import UserError
 from neural_gash_addon.backend.exchange import atomic
 from neural_gash_addon.backend.geometry import TriangleMesh
+from neural_gash_addon.backend.record import BakeRecord
 
 RAYS = 64
+# What `sparse` is told instead, as it would itself trace every point of hosts as coarse as these for the 3 to 6 % that
+# RAYS give: a relative error, and how many points there are for each of its first samples.
+SPARSE_TOLERANCE, SPARSE_STRIDE = 0.2, 8
 RED_RATIO, RED_ERROR = 1.5, 0.01  # a red cell's worst case has so many times the error, and so much more in all
 _NOTHING = 1e-6  # an error below which all is rounding
 GROUPS: dict[str, tuple[Callable[[Scale], Pairs], ...]] = {**trials_surface.TRIALS, **trials_scene.TRIALS}
@@ -52,6 +57,7 @@ class Cell:
     worst_typical: float  # and how large
     calm: float          # RMS of that mesh undisturbed
     refused: str = ""
+    commit: str = ""     # of which it is; + where files had changed since
 
     @property
     def ratio(self) -> float:
@@ -66,7 +72,8 @@ class Cell:
 
 def settings() -> list[Setting]:
     """Every method of the table."""
-    return compare.settings_of(ORDER, (RAYS,))
+    return [replace(setting, rays=None, tolerance=SPARSE_TOLERANCE) if setting.method == "sparse" else setting
+            for setting in compare.settings_of(ORDER, (RAYS,))]
 
 
 def _errors(variant: Variant, setting: Setting) -> np.ndarray:
@@ -77,7 +84,21 @@ def _errors(variant: Variant, setting: Setting) -> np.ndarray:
 @lru_cache(maxsize=64)
 def _baked(mesh: TriangleMesh, setting: Setting) -> np.ndarray:
     """Coefficients (N, K); trial after trial asks for those of the undisturbed meshes."""
-    return methods.run(compare.vertex_bake(mesh)(setting, 0))[0]
+    return bake(mesh, setting, 0)[0]
+
+
+def bake(mesh: TriangleMesh, setting: Setting, seed: int) -> tuple[np.ndarray, BakeRecord | None]:
+    """Coefficients (N, K) of a method, and its record.
+
+    Fewer than 16,384 points are all traced by `sparse`, and hosts have a tenth of that. That it is tried at all, its
+    first samples, of which the threshold is a multiple, are as much fewer.
+    """
+    baking = compare.vertex_bake(mesh)(setting, seed)
+    if setting.method != "sparse":
+        return methods.run(baking)
+    fewest = min(sparse_bake.FEWEST, max(1, len(mesh.points) // SPARSE_STRIDE))
+    with patch.object(sparse_bake, "FEWEST", fewest):
+        return methods.run(baking)
 
 
 def _ratio(error: float, calm: float) -> float:
@@ -116,21 +137,22 @@ def tried(group: str, trial: Callable[[Scale], Pairs], scale: Scale, chosen: Seq
 def noise(scale: Scale, chosen: Sequence[Setting]) -> list[dict[str, object]]:
     """Seeds: how far the true error spreads, and how near it is what the report claims.
 
-    A claim that is too small is a promise broken, one that is too large is time wasted. What traces nothing has nothing
-    to throw dice for: two seeds show that.
+    A claim that is too small is a promise broken, one that is too large is time wasted. Where a second seed changes
+    nothing, no dice are thrown, and two are enough.
     """
     found: list[dict[str, object]] = []
     for setting in chosen:
         for host in undisturbed(scale):
             true, claims = [], []
-            seeds = scale.seeds if methods.METHODS[setting.method].traces else 2
-            for seed in range(seeds):
-                coefficients, record = methods.run(compare.vertex_bake(host.mesh)(setting, seed))
+            for seed in range(scale.seeds):
+                coefficients, record = bake(host.mesh, setting, seed)
                 true.append(metrics.rel_l2(coefficients[host.rows], host.truth))
                 if record is not None and record.error_estimate is not None:
                     claims.append(record.error_estimate)
+                if seed == 1 and true[0] == true[1]:
+                    break
             ratios = [claim / error for claim, error in zip(claims, true, strict=False)]
-            found.append({"method": setting.method, "mesh": host.name, "seeds": seeds,
+            found.append({"method": setting.method, "mesh": host.name, "seeds": len(true),
                           "error": float(np.median(true)), "least": min(true), "most": max(true),
                           "claim": float(np.median(claims)) if claims else None,
                           "lowest": min(ratios, default=None), "highest": max(ratios, default=None)})
@@ -144,11 +166,13 @@ def table(cells: Sequence[Cell]) -> str:
     by = {(cell.trial, cell.method): cell for cell in cells}
     group = ""
     for trial in dict.fromkeys(cell.trial for cell in cells):
-        first = by[trial, names[0]]
-        if first.group != group:
-            group = first.group
+        own = [by.get((trial, name)) for name in names]
+        of = next(cell.group for cell in own if cell)
+        if of != group:
+            group = of
             lines.append(f"| **{group}** |" + " |" * len(names))
-        lines.append(f"| {trial.replace('_', ' ')} | " + " | ".join(_cell(by[trial, name]) for name in names) + " |")
+        lines.append(f"| {trial.replace('_', ' ')} | " + " | ".join("" if cell is None else _cell(cell) for cell in own)
+                     + " |")
     return "\n".join(lines)
 
 
@@ -197,33 +221,66 @@ def _missing(rows: Sequence[dict], chosen: Sequence[Setting]) -> list[Setting]:
 
 
 def _with(part: dict[str, Any] | None, name: str, rows: list[dict]) -> dict[str, Any]:
-    """A part of the results with rows added, in the order of the table of methods, and of which commits they are."""
-    whole, now = [*(part or {}).get(name, []), *rows], about()
-    commits = sorted({*(part or {}).get("commit", now["commit"]).split(", "), now["commit"]})
+    """A part of the results with rows added, each with its commit, in the order of the table of methods."""
+    now = about()
+    commit = now.pop("commit")
+    whole = [*(part or {}).get(name, []), *({**row, "commit": commit} for row in rows)]
     whole.sort(key=lambda row: list(methods.METHODS).index(row["method"]))
-    return {**now, "commit": ", ".join(commits), name: whole}
+    return {**now, name: whole}
+
+
+def _forget(results: dict[str, Any], method: str | None, asked: Callable[[str], bool]) -> None:
+    """Drop what is known of a method in the parts that are asked for, so that it is tried anew."""
+    for name, part in {**results["trials"], "noise": results["noise"]}.items():
+        for rows in ({"cells", "rows"} & part.keys()) if asked(name) else ():
+            part[rows] = [row for row in part[rows] if row["method"] != method]
+    if method == "embedding" and asked("rooms"):
+        results.pop("rooms", None)  # they try its network for light from within
+
+
+def _commits(rows: Sequence[dict]) -> str:
+    """Of which commits the rows of the methods are."""
+    by: dict[str, set[str]] = {}
+    for row in rows:
+        by.setdefault(row["method"], set()).update(row["commit"].split(", "))
+    alike: dict[str, list[str]] = {}
+    for method, commits in by.items():
+        alike.setdefault(", ".join(sorted(commits)), []).append(f"`{method}`")
+    return "; ".join(f"{', '.join(names)} {commits}" for commits, names in alike.items())
+
+
+def origin(results: dict[str, Any]) -> str:
+    """Where the numbers were measured, and of which commits those of each method are."""
+    rooms = results.get("rooms", {})
+    parts = (*results["trials"].values(), results["noise"], rooms)
+    machines = "; ".join(sorted({part["machine"] for part in parts if "machine" in part}))
+    cells = [cell for part in results["trials"].values() for cell in part["cells"]]
+    return (f"Machine: {machines}. Seed 0; {REFERENCE_SEED} of the references.\n\n"
+            f"Commits (+: with changes) of the trials: {_commits(cells)}. Of the noise: "
+            f"{_commits(results['noise'].get('rows', []))}. Of the rooms: {rooms.get('commit', '')}.")
 
 
 def main() -> int:
     """Run all trials and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="small procedural meshes")
-    parser.add_argument("--only", help="trials whose name has this in it")
+    parser.add_argument("--only", help="trials whose name has this in it; or noise, rooms")
     parser.add_argument("--again", choices=methods.METHODS, help="try this method anew, as it is another now")
     parser.add_argument("--out", type=Path, help="a file for the numbers, as JSON")
     parser.add_argument("--page", type=Path, help="page whose tables are replaced by this run's")
     arguments = parser.parse_args()
     scale = SMALL if arguments.quick else FULL
     chosen = settings()
-    compare.warm(chosen)
-    trials = [(group, trial) for group, found in GROUPS.items() for trial in found
-              if not arguments.only or arguments.only in trial.__name__]
+
+    def asked(name: str) -> bool:
+        return not arguments.only or arguments.only in name
+
+    every = [(group, trial) for group, found in GROUPS.items() for trial in found]
+    trials = [(group, trial) for group, trial in every if asked(trial.__name__)]
     results: dict[str, Any] = {"trials": {}, "noise": {}}
     if arguments.out and arguments.out.is_file():
         results = json.loads(arguments.out.read_text(encoding="utf-8"))
-        for part, name in [*((trial, "cells") for trial in results["trials"].values()), (results["noise"], "rows")]:
-            if name in part:
-                part[name] = [row for row in part[name] if row["method"] != arguments.again]
+        _forget(results, arguments.again, asked)
     with tqdm(trials, unit="trial") as bar:
         for group, trial in bar:
             bar.set_description(trial.__name__)
@@ -231,25 +288,21 @@ def main() -> int:
                 found = [asdict(cell) for cell in tried(group, trial, scale, missing)]
                 results["trials"][trial.__name__] = _with(results["trials"].get(trial.__name__), "cells", found)
                 _save(arguments.out, results)
-    if not arguments.only and (missing := _missing(results["noise"].get("rows", []), chosen)):
+    if asked("noise") and (missing := _missing(results["noise"].get("rows", []), chosen)):
         results["noise"] = _with(results["noise"], "rows", noise(scale, missing))
         _save(arguments.out, results)
     rooms = ""
     if find_spec("torch"):
         import trials_rooms  # needs it
 
-        if not arguments.only and not results.get("rooms"):
+        if asked("rooms") and not results.get("rooms"):
             found = trials_rooms.tried(8 if arguments.quick else 1)
             results["rooms"] = {**about(), "rows": found}
             _save(arguments.out, results)
         rooms = trials_rooms.table(results.get("rooms", {}).get("rows", []))
-    every = (*results["trials"].values(), results["noise"], results.get("rooms", {}))
-    parts = [part for part in every if "commit" in part]
-    machines = "; ".join(sorted({part["machine"] for part in parts}))
-    commits = ", ".join(sorted({commit for part in parts for commit in part["commit"].split(", ")}))
-    cells = [Cell(**cell) for _, trial in trials for cell in results["trials"][trial.__name__]["cells"]]
-    texts = {"origin": f"Machine: {machines}. Commit: {commits}. Seed 0; {REFERENCE_SEED} of the references.",
-             "table": table(cells), "noise": noise_table(results["noise"].get("rows", [])), "red": red_list(cells),
+    cells = [Cell(**cell) for _, trial in every for cell in results["trials"].get(trial.__name__, {}).get("cells", [])]
+    texts = {"origin": origin(results), "table": table(cells),
+             "noise": noise_table(results["noise"].get("rows", [])), "red": red_list(cells),
              "rooms": rooms}
     if arguments.page:
         fill(arguments.page, texts)

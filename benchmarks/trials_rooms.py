@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rooms lit from within, and where the light-transport embedding might fail in them (its paper's section 5).
+"""Rooms lit from within, and where the light-transport embedding might fail in them (its paper's section 6).
 
 Errors are root mean squares over the root mean square of the truth, without what the truth's own noise adds.
 """

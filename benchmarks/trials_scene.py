@@ -162,8 +162,10 @@ def constant(scale: Scale) -> Pairs:
 def energy(scale: Scale) -> Pairs:
     """No point may show less than nothing of a white sky or more than all, nor be darker under a sun than it rings.
 
-    The error is by how much it is. How far a light of three bands rings below zero is what the most negative point of
-    the unshadowed or of the true answer says.
+    The error is by how much it is, under the sun as a part of the brightest unshadowed point. Three bands cannot hold a
+    sun: what they hold of it is less than nothing beside and behind it, and so is what points there show that are baked
+    exactly. So a point may show as little as the darkest one does without shadows or in the reference; how little that
+    is, is in the case's label.
     """
     lamp = light.sun(np.array([0.6, 0, 0.8]), np.ones(3), ORDER)
 
@@ -180,13 +182,17 @@ def energy(scale: Scale) -> Pairs:
             return np.maximum(rings - (found[0][host.rows] @ lamp).min(1), 0) / whole
 
         yield Variant(f"{host.name}, white sky", [host.mesh], white)
-        yield Variant(f"{host.name}, sun", [host.mesh], sunlit)
+        yield Variant(f"{host.name}, sun, as low as {rings / whole:.2%}", [host.mesh], sunlit)
 
     return each(scale, disturb)
 
 
 def flicker(scale: Scale) -> Pairs:
     """Frames of a deforming mesh: what changes from one to the next beyond what truly does.
+
+    Errors that stay where they are pass for the look of a surface; errors that come and go are seen as boiling, however
+    small, and no frame by itself says which they are. The true change, RMS over points, is in the case's label: an
+    error as large as that hides the motion of the shadows.
 
     The undisturbed case is the error of a frame by itself, so a method whose errors stay where they are has less than
     1, and one whose errors are new in each frame 1.4.

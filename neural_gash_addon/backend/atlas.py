@@ -112,7 +112,7 @@ def place(parts: Sequence[Part], *, side: int | None = None, texels_per_metre: f
         if side is None:
             _check_density(atlas.side)
     uvs = np.split(atlas.uv, np.cumsum([c.corner_count for c in charts])[:-1])
-    alone = np.split(atlas.alone, np.cumsum([len(c.triangles) for c in charts])[:-1])
+    alone = np.split(atlas.alone, np.cumsum([len(c.polygons) for c in charts])[:-1])
     return [Placed(uv, len(np.unique(c.polygons[a]))) for uv, a, c in zip(uvs, alone, charts, strict=True)], atlas.side
 
 

@@ -17,7 +17,7 @@ from .raycast import Geometry, used
 from .workers import product
 
 _LEAF = 64              # vertices of a ball that are compared with a plane at a time
-_MOST_PAIRS = 5e8       # of points and balls: what takes longer is not looked at, but traced
+_MOST_PAIRS = 1e6       # of points and balls, 50 to 100 ms: what takes longer is not looked at, but traced
 _LEVEL = 1e-6           # of the extent: heights over a plane that are rounding
 _FEW = 64               # normals that are compared with every vertex
 _SAME = 1e-7            # components of normals that do not differ by more are the same

@@ -19,6 +19,7 @@ CHECKED_SIDE = 1024   # at which overlaps are looked for: a finer look would fin
 _REACH = 2 ** 0.5     # texels: a bilinear lookup reads texels whose centre is less than 1 away in x and in y
 _STEP = 0.5           # texels between the samples of an outline that find the texels beside it
 _FARTHEST = 1.0       # barycentric coordinates of centres outside a sliver run away; normals must not
+_TOUCH = 0.01         # texels from an edge, within which a centre is not taken for inside of two triangles
 _PIECE = 1 << 20      # what is expanded at a time
 
 
@@ -82,10 +83,17 @@ class Layout:
                         np.concatenate([inside, nearest])[order], np.concatenate([inside, at_centre])[order])
 
     def overlapping(self) -> NDArray[np.int64]:
-        """(m, 2) pairs of triangles that hold the same texel's centre, each pair once."""
+        """(m, 2) pairs of triangles that hold the same texel's centre, each pair once.
+
+        Not those that only touch: islands side by side in 32-bit UVs lie over each other by a rounding.
+        """
         texels, faces = _centres_inside(self._corners, self.side, 0, self.side)
         order = np.lexsort((faces, texels))
         texels, faces = texels[order], faces[order]
+        same = texels[1:] == texels[:-1]
+        shared = np.flatnonzero(np.append(same, False) | np.append(False, same))
+        deep = shared[_deep(self._corners, faces[shared], _centre(texels[shared], self.side))]
+        texels, faces = texels[deep], faces[deep]
         again = np.flatnonzero(texels[1:] == texels[:-1])
         return np.unique(np.stack([faces[again], faces[again + 1]], 1), axis=0)
 
@@ -100,13 +108,13 @@ def check_range(uv: NDArray) -> None:
                         f"triangle {int(beyond.argmax())}); a bake needs a place of its own for every face.")
 
 
-def _expand(counts: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def expand(counts: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """For counts (n,): the owner of each of their sum's entries, and its number within the owner's."""
     owner = np.repeat(np.arange(len(counts)), counts)
     return owner, np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
-def _pieces(counts: NDArray[np.int64]):
+def pieces(counts: NDArray[np.int64]):
     """Slices of `counts` whose sums are about _PIECE."""
     ends = np.cumsum(counts)
     start = 0
@@ -130,8 +138,8 @@ def _centres_inside(corners: NDArray, side: int, start: int, stop: int) -> tuple
     lower = np.where(swap, np.roll(corners, -1, 1), corners)   # (F, 3, 2) lower end of each edge
     upper = np.where(swap, corners, np.roll(corners, -1, 1))
     found_texels, found_faces = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    for piece in _pieces(rows):
-        face, row = _expand(rows[piece])
+    for piece in pieces(rows):
+        face, row = expand(rows[piece])
         face += piece.start
         row += first_row[face]
         y = row + 0.5
@@ -144,8 +152,8 @@ def _centres_inside(corners: NDArray, side: int, start: int, stop: int) -> tuple
         left, right = np.nanmin(cuts, 1), np.nanmax(cuts, 1)
         column = np.maximum(np.ceil(left - 0.5).astype(np.int64), 0)
         count = np.maximum(np.minimum(np.ceil(right - 0.5).astype(np.int64), side) - column, 0)
-        for part in _pieces(count):
-            span, step = _expand(count[part])
+        for part in pieces(count):
+            span, step = expand(count[part])
             span += part.start
             found_texels.append(row[span] * side + column[span] + step)
             found_faces.append(face[span])
@@ -182,8 +190,8 @@ def _border(corners: NDArray, outline: NDArray[np.int64], side: int, start: int,
     best = np.full(len(free), np.inf)
     texels: list[NDArray] = []
     owners, places, squared = list(texels), list(texels), list(texels)
-    for piece in _pieces(samples * 9):
-        which, step = _expand(samples[piece])
+    for piece in pieces(samples * 9):
+        which, step = expand(samples[piece])
         which += piece.start
         share = step / np.maximum(samples[which] - 1, 1)
         cell = np.floor(a[which] + share[:, None] * (b - a)[which]).astype(np.int64)
@@ -230,6 +238,15 @@ def _barycentric(corners: NDArray, faces: NDArray, points: NDArray) -> NDArray[n
                     np.zeros(len(points))], 1)
     out[:, 2] = 1 - out[:, 0] - out[:, 1]
     out[flat] = 1 / 3
+    return out
+
+
+def _deep(corners: NDArray, faces: NDArray, points: NDArray) -> NDArray[np.bool_]:
+    """(n,) points (n, 2) inside some of the triangles (F, 3, 2) that are not at an edge of theirs."""
+    out = np.ones(len(faces), bool)
+    for corner in range(3):
+        start, edge = corners[faces, corner], corners[faces, (corner + 1) % 3] - corners[faces, corner]
+        out &= np.abs(_cross(edge, points - start)) > _TOUCH * np.linalg.norm(edge, axis=1)
     return out
 
 

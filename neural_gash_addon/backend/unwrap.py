@@ -5,6 +5,9 @@ xatlas takes time that grows faster than its charts, rasters each chart at the s
 holds the interpreter's lock meanwhile. So the mesh is cut into pieces of neighbouring faces; xatlas
 charts each by itself, at a tiny resolution, and `packing` places the charts of all. On 18,000 triangles
 that takes a fifth of the time at the default options, and a window gets its turn between the pieces.
+
+Some charts of xatlas lie over themselves, mostly beside a slit. `folds` says where, and the faces that it
+takes become charts of their own, before anything is placed.
 """
 from __future__ import annotations
 
@@ -16,14 +19,13 @@ from numpy.typing import NDArray
 
 from .errors import UserError
 from .estimator import morton_order
+from .folds import overlapping, taken_out
 from .geometry import Surface, unit
 from .packing import arranged, boxed
 from .progress import scaled
-from .raster import CHECKED_SIDE, Layout
 
 PIECE = 1000           # triangles that xatlas charts at a time: 40 ms at most
 _DRAFT_RESOLUTION = 16  # of a piece's own packing, which is thrown away
-_REPAIRS = 3           # times that faces which lie over each other are laid out anew, each alone
 _FLAT = 1e-10          # of a face's area that is left in UVs: less, and it has collapsed
 
 
@@ -32,25 +34,21 @@ class Charts:
     """The faces of one or several meshes cut into charts, each flat in a plane of its own; not in a texture yet."""
 
     local: NDArray[np.float64]        # (F, 3, 2) of each triangle's corners, metres
-    positions: NDArray[np.float64]    # (V, 3)
-    triangles: NDArray[np.int32]      # (F, 3)
     corners: NDArray[np.int32]        # (F, 3) face corners
     polygons: NDArray[np.int32]       # (F,)
     corner_count: int                 # C, of the mesh or of all together
     charts: NDArray[np.int64]         # (F,) number of each triangle's chart
-    alone: NDArray[np.bool_]          # (F,) triangles of polygons that xatlas cannot chart
+    alone: NDArray[np.bool_]          # (F,) triangles of polygons that are a chart each, as xatlas cannot chart them
 
     @staticmethod
     def joined(parts: Sequence[Charts], scales: Sequence[float]) -> Charts:
         """The charts of several meshes, each as large as `scales` says, their corners counted on."""
-        vertices, corners, polygons, charts = (
+        corners, polygons, charts = (
             np.concatenate([[0], np.cumsum(counts)]) for counts in (
-                [len(p.positions) for p in parts], [p.corner_count for p in parts],
-                [int(p.polygons.max()) + 1 for p in parts], [int(p.charts.max()) + 1 for p in parts]))
+                [p.corner_count for p in parts], [int(p.polygons.max()) + 1 for p in parts],
+                [int(p.charts.max()) + 1 for p in parts]))
         return Charts(
             np.concatenate([p.local * scale for p, scale in zip(parts, scales, strict=True)]),
-            np.concatenate([p.positions * scale for p, scale in zip(parts, scales, strict=True)]),
-            np.concatenate([p.triangles + n for p, n in zip(parts, vertices, strict=False)]),
             np.concatenate([p.corners + n for p, n in zip(parts, corners, strict=False)]),
             np.concatenate([p.polygons + n for p, n in zip(parts, polygons, strict=False)]),
             int(corners[-1]), np.concatenate([p.charts + n for p, n in zip(parts, charts, strict=False)]),
@@ -88,15 +86,17 @@ def cut(surface: Surface) -> Generator[float, None, Charts]:
     positions, triangles, corners = surface.positions, surface.triangles, surface.corners
     normals, polygons = surface.corner_normals, surface.polygons
     local, charts = np.zeros((len(triangles), 3, 2)), np.zeros(len(triangles), np.int64)
+    alone = np.zeros(len(triangles), bool)
     pieces = _pieces(positions, triangles, polygons)
     count = 0
     for number, piece in enumerate(pieces):
-        local[piece], found = _chart(xatlas, positions, triangles[piece], normals[corners[piece]])
+        flat, found = _chart(xatlas, positions, triangles[piece], normals[corners[piece]])
+        local[piece], found, alone[piece] = _apart(flat, found, positions[triangles[piece]], corners[piece],
+                                                   polygons[piece])
         charts[piece] = found + count
         count += int(found.max()) + 1
         yield (number + 1) / len(pieces)
-    alone = _torn(local, positions, triangles, corners, polygons)
-    return Charts(local, positions, triangles, corners, polygons, len(normals), charts, alone)
+    return Charts(local, corners, polygons, len(normals), charts, alone)
 
 
 def lay_out(charts: Charts, *, side: int | None, texels_per_metre: float | None = None, padding: int = 2,
@@ -111,26 +111,13 @@ def lay_out(charts: Charts, *, side: int | None, texels_per_metre: float | None 
     Raises:
         UserError: the texture is too small for its charts.
     """
-    triangles, polygons = charts.triangles, charts.polygons
-    local, alone = charts.local.copy(), charts.alone.copy()
+    numbers = np.unique(charts.charts, return_inverse=True)[1]
+    turned, boxes = yield from scaled(boxed(charts.local, numbers), 0, 0.6)
+    packing = arranged(boxes, _area(charts.local), side=side, density=texels_per_metre, padding=padding)
+    corner, side, scale = yield from scaled(packing, 0.6, 0.4)
     uv = np.zeros((charts.corner_count, 2))
-    for number in range(_REPAIRS):
-        numbers = charts.charts
-        if alone.any():
-            local[alone] = _laid_flat(charts.positions[triangles[alone]], polygons[alone])
-            numbers = np.where(alone, numbers.max() + 1 + polygons, numbers)
-        numbers = np.unique(numbers, return_inverse=True)[1]
-        share = 1 / _REPAIRS
-        turned, boxes = yield from scaled(boxed(local, numbers), number * share, 0.6 * share)
-        packing = arranged(boxes, _area(local), side=side, density=texels_per_metre, padding=padding)
-        corner, found_side, scale = yield from scaled(packing, (number + 0.6) * share, 0.4 * share)
-        placed = (turned * scale + corner[numbers][:, None]) / found_side
-        uv[charts.corners] = placed
-        pairs = Layout(placed, triangles, min(found_side, CHECKED_SIDE)).overlapping()
-        if not len(pairs):
-            break
-        alone |= np.isin(polygons, polygons[pairs])  # of charts that lie over themselves
-    return Atlas(uv, found_side, scale, alone)
+    uv[charts.corners] = (turned * scale + corner[numbers][:, None]) / side
+    return Atlas(uv, side, scale, charts.alone)
 
 
 def _xatlas():
@@ -213,29 +200,77 @@ def _median(values: NDArray, weights: NDArray) -> float:
     return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
 
 
-def _torn(local: NDArray, positions: NDArray, triangles: NDArray, corners: NDArray, polygons: NDArray
-          ) -> NDArray[np.bool_]:
-    """(F,) triangles of polygons that were collapsed, or cut by a seam between their triangles."""
-    area = 0.5 * np.linalg.norm(np.cross(positions[triangles[:, 1]] - positions[triangles[:, 0]],
-                                         positions[triangles[:, 2]] - positions[triangles[:, 0]]), axis=1)
-    a, b = local[:, 1] - local[:, 0], local[:, 2] - local[:, 0]
-    flat = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    bad = (area > 0) & ~(flat > _FLAT * area)
+def _apart(local: NDArray, charts: NDArray[np.int64], points: NDArray, corners: NDArray, polygons: NDArray
+           ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
+    """UVs and charts as `_chart` found them, but for polygons that these do not suit: each of those is a chart.
+
+    Args:
+        local: (f, 3, 2) UVs of triangles, metres. charts: (f,). points: (f, 3, 3) of their corners.
+        corners: (f, 3) face corners. polygons: (f,).
+    Returns:
+        UVs, charts, and which triangles (f,) are of such polygons.
+    """
+    corners = np.unique(corners, return_inverse=True)[1].reshape(-1, 3)
+    polygons = np.unique(polygons, return_inverse=True)[1]
+    alone = _torn(local, points, corners, polygons)
+    rest = np.flatnonzero(~alone)
+    alone |= np.isin(polygons, taken_out(polygons[rest[overlapping(local[rest], charts[rest])]]))
+    if alone.any():
+        local = local.copy()
+        local[alone] = _laid_flat(points[alone], corners[alone], polygons[alone])
+        charts = np.where(alone, charts.max() + 1 + polygons, charts)
+    return local, charts, alone
+
+
+def _torn(local: NDArray, points: NDArray, corners: NDArray, polygons: NDArray) -> NDArray[np.bool_]:
+    """(f,) triangles of polygons that were collapsed, or cut by a seam between their triangles."""
+    bad = _collapsed(local, points)
     one = np.zeros((int(corners.max()) + 1, 2))
     one[corners] = local  # any one triangle's, to compare the others with
     grain = 1e-6 * float(np.abs(local).max(initial=0.0)) + 1e-300
     bad |= np.any(np.abs(one[corners] - local) > grain, axis=(1, 2))
-    torn = np.zeros(int(polygons.max()) + 1, bool)
-    torn[polygons[bad]] = True
-    return torn[polygons]
+    return np.isin(polygons, polygons[bad])
 
 
-def _laid_flat(points: NDArray, polygons: NDArray) -> NDArray[np.float64]:
-    """(f, 3, 2) UVs in metres of triangles (f, 3, 3): each polygon projected on its mean plane."""
+def _collapsed(local: NDArray, points: NDArray) -> NDArray[np.bool_]:
+    """(f,) triangles (f, 3, 3) that have an area, but none in UVs (f, 3, 2)."""
+    area = 0.5 * np.linalg.norm(np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]), axis=1)
+    a, b = local[:, 1] - local[:, 0], local[:, 2] - local[:, 0]
+    flat = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    return (area > 0) & ~(flat > _FLAT * area)
+
+
+def _laid_flat(points: NDArray, corners: NDArray, polygons: NDArray) -> NDArray[np.float64]:
+    """(f, 3, 2) UVs in metres of triangles (f, 3, 3): each polygon projected on its mean plane.
+
+    Where that folds it, its corners (f, 3) go on a circle instead: there no triangles lie over each other.
+    """
     face = np.unique(polygons, return_inverse=True)[1]
     cross = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
     normal = unit(np.stack([np.bincount(face, cross[:, axis]) for axis in range(3)], 1))
     first = unit(np.cross(normal, np.eye(3)[np.abs(normal).argmin(1)]))
     axes = np.stack([first, np.cross(normal, first)], 1)[face]       # (f, 2, 3)
     flat: NDArray[np.float64] = np.einsum("fcx,fax->fca", points - points.reshape(-1, 3).mean(0), axes)
+    folded = np.isin(face, np.concatenate([face[overlapping(flat, face)[:, 0]], face[_collapsed(flat, points)]]))
+    if folded.any():
+        flat[folded] = _on_circle(np.linalg.norm(cross[folded], axis=1) / 2, corners[folded], face[folded])
     return flat
+
+
+def _on_circle(areas: NDArray, corners: NDArray, polygons: NDArray) -> NDArray[np.float64]:
+    """(f, 3, 2) UVs in metres of triangles: the corners (f, 3) of each polygon evenly on a circle.
+
+    Args:
+        areas: (f,) of the triangles; a polygon has as much as its own together.
+    """
+    _, face = np.unique(polygons, return_inverse=True)
+    _, first, corner = np.unique(corners, return_index=True, return_inverse=True)
+    owner = face[first // 3]                                # of each corner; they rise around a polygon
+    count = np.bincount(owner)
+    order = np.argsort(owner, kind="stable")
+    rank = np.empty(len(owner), np.int64)
+    rank[order] = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
+    angle = 2 * np.pi * rank / count[owner]
+    radius = np.sqrt(2 * np.bincount(face, areas) / (count * np.sin(2 * np.pi / count)))[owner]
+    places: NDArray[np.float64] = np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1)
+    return places[corner.reshape(-1, 3)]

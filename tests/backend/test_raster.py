@@ -38,6 +38,13 @@ def slow_inside(uv, side):
     return found
 
 
+def near_an_edge(triangle, texel, side):
+    """Whether a texel's centre is within a hundredth of a texel of the lines along a triangle's edges."""
+    centre = np.array([texel % side + 0.5, texel // side + 0.5])
+    normals = (triangle - np.roll(triangle, 1, 0))[:, ::-1] * [-1, 1]
+    return (np.abs(((centre - triangle) * normals).sum(1)) <= 0.01 * np.linalg.norm(normals, axis=1)).any()
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_centres_equal_the_slow_twin(seed):
     rng = np.random.default_rng(seed)
@@ -50,6 +57,8 @@ def test_centres_equal_the_slow_twin(seed):
     for texel, face in zip(found.texels[inside], found.faces[inside], strict=True):
         assert face == min(slow[texel])
     pairs = {tuple(p) for p in Layout(uv, triangles, side).overlapping()}
+    slow = {texel: [face for face in faces if not near_an_edge(uv[face] * side, texel, side)]
+            for texel, faces in slow.items()}
     assert {(a, b) for faces in slow.values() for a, b in zip(faces[:-1], faces[1:], strict=True)} == pairs
 
 
@@ -145,3 +154,12 @@ def test_empty_texels_show_the_nearest_covered_one():
             away = np.hypot(there // 40 - row, there % 40 - column)
             assert away <= nearest + 0.6 if nearest <= 3 else away <= 8 * nearest
     assert (fill_map(np.zeros((8, 8), bool)) == 0).all()
+
+
+@pytest.mark.parametrize(("by", "pairs"), [(1e-7, 0), (0.002, 0), (0.05, 1)])
+def test_islands_that_touch_do_not_overlap(by, pairs):
+    """Two sides of a line through centres, moved over each other by some texels."""
+    line = 20.5
+    one = np.array([[5, line + by / 2], [55, line + by / 2], [30, 5]])
+    other = np.array([[5, line - by / 2], [55, line - by / 2], [30, 60]])
+    assert len(Layout(np.stack([one, other]) / 64, np.arange(6).reshape(2, 3), 64).overlapping()) == pairs

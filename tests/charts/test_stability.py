@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Every trial of `make stability`, in small: what must hold of the methods that are exact; failures are found."""
+import json
 import math
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,11 @@ sys.path.insert(0, str(ROOT))
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import stability  # noqa: E402
-from trial import SMALL, box, undisturbed  # noqa: E402
+import trials_rooms  # noqa: E402
+import trials_scene  # noqa: E402
+from trial import FULL, SMALL, box, hosts, smooth, undisturbed  # noqa: E402
 
-from neural_gash_addon.backend import compare, methods  # noqa: E402
+from neural_gash_addon.backend import compare, methods, sparse_bake  # noqa: E402
 from neural_gash_addon.backend.compare import Setting  # noqa: E402
 
 TRIALS = [(group, trial) for group, found in stability.GROUPS.items() for trial in found]
@@ -69,7 +72,32 @@ def test_claims_are_near_the_truth():
     assert 0.7 < traced["lowest"] <= traced["highest"] < 1.5
     assert traced["least"] < traced["most"] < 1.5 * traced["least"]
     assert none["claim"] is None and none["least"] == none["most"]
+    assert traced["seeds"] == SMALL.seeds and none["seeds"] == 2
     assert "claim over truth" in stability.noise_table(found)
+
+
+def test_the_embedding_traces_its_scene_points_and_gets_all_seeds():
+    row, = stability.noise(SMALL, [Setting("embedding", 3)])
+    assert row["seeds"] == SMALL.seeds and row["least"] < row["most"]
+    assert row["claim"] and row["lowest"] <= row["highest"]
+
+
+def test_sparse_leaves_points_out_of_the_hosts():
+    setting, = (setting for setting in stability.settings() if setting.method == "sparse")
+    for name, geometry in hosts(FULL):  # those of SMALL are so coarse that every point is worth it
+        mesh = smooth(geometry)
+        coefficients, record = stability.bake(mesh, setting, 0)
+        # a sample takes that many rays or more, so these are not enough for all points
+        assert 0 < record.rays < sparse_bake._LEAST_RAYS * len(mesh.points), name
+        assert np.linalg.norm(coefficients, axis=1).min() > 0 and record.error_estimate <= stability.SPARSE_TOLERANCE
+    assert sparse_bake.FEWEST == 4096
+
+
+def test_cases_say_what_is_allowed():
+    energy = [variant.label for _, disturbed in trials_scene.energy(SMALL) for variant in disturbed]
+    rings = [float(label.split("as low as ")[1].rstrip("%")) for label in energy if "sun" in label]
+    assert len(rings) == len(hosts(SMALL)) and all(-20 < share < -1 for share in rings)
+    assert all("true change" in variant.label for _, disturbed in trials_scene.flicker(SMALL) for variant in disturbed)
 
 
 def test_boxes_are_closed_and_face_outward():
@@ -86,22 +114,20 @@ def test_the_undisturbed_truth_is_the_bake_with_many_rays():
 
 
 def test_what_is_there_is_not_run_again(tmp_path, monkeypatch, capsys):
-    import json
     out, page = tmp_path / "stability.json", tmp_path / "page.md"
     page.write_text("".join(f"<!-- {name} -->\n<!-- end -->\n" for name in
                             ("origin", "table", "noise", "red", "rooms")))
     monkeypatch.setattr(sys, "argv", ["stability", "--quick", "--only", "dark", "--out", str(out), "--page", str(page)])
     assert stability.main() == 0
     known = json.loads(out.read_text())
-    assert set(known["trials"]) == {"dark"} and known["trials"]["dark"]["commit"]
+    assert set(known["trials"]) == {"dark"} and all(cell["commit"] for cell in known["trials"]["dark"]["cells"])
     monkeypatch.setattr(stability, "tried", None)
     first = page.read_text()
     assert stability.main() == 0 and page.read_text() == first and "| dark | 0 / 0 %" in first
-    assert "Commit: " in first and json.loads(out.read_text()) == known
+    assert "Commits (" in first and json.loads(out.read_text()) == known
 
 
 def test_a_method_that_is_another_now_is_tried_alone(tmp_path, monkeypatch):
-    import json
     out = tmp_path / "stability.json"
     monkeypatch.setattr(sys, "argv", ["stability", "--quick", "--only", "dark", "--out", str(out)])
     assert stability.main() == 0
@@ -112,3 +138,30 @@ def test_a_method_that_is_another_now_is_tried_alone(tmp_path, monkeypatch):
     assert stability.main() == 0
     assert [setting.method for setting in asked] == ["gnn"]
     assert json.loads(out.read_text())["trials"]["dark"]["cells"] == known  # in the same order
+
+
+def test_parts_are_done_again_by_themselves_and_the_rooms_with_their_network(tmp_path, monkeypatch):
+    room = {"where": "here", "light": 1.0, "errors": [0.0] * len(trials_rooms.COLUMNS)}
+    dark = asdict(stability.Cell("light", "dark", "embedding", 0.0, 0.0, "", 0.0, 0.0, commit="old"))
+    known = {"trials": {"dark": {"cells": [dark]}}, "noise": {"rows": []}, "rooms": {"commit": "old", "rows": [room]}}
+    out = tmp_path / "stability.json"
+    out.write_text(json.dumps(known))
+    monkeypatch.setattr(stability, "tried", None)  # no trial is run
+    monkeypatch.setattr(trials_rooms, "tried", lambda scale: [room, room])
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["stability", "--quick", "--out", str(out), *words])
+        assert stability.main() == 0
+        return json.loads(out.read_text())
+
+    assert run("--only", "rooms", "--again", "gnn") == known
+    found = run("--only", "rooms", "--again", "embedding")
+    assert len(found["rooms"]["rows"]) == 2 and found["rooms"]["commit"] != "old"
+    assert found["trials"] == known["trials"]
+    monkeypatch.setattr(stability, "noise", lambda scale, chosen: [
+        {"method": setting.method, "mesh": "knot", "error": 0.1, "least": 0.1, "most": 0.1, "claim": None}
+        for setting in chosen])
+    found = run("--only", "noise", "--again", "embedding")
+    assert {each["method"] for each in found["noise"]["rows"]} == set(methods.METHODS)
+    assert found["trials"] == known["trials"]
+    assert "`embedding` old" in stability.origin(found)
