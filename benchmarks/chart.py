@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[1]
 def summary(rows: list[chart_draw.Row]) -> str:
     """Medians over the meshes of the base sweep, and the peers' of theirs: a table in Markdown."""
     titles = ("method", "rays", "meshes", "µs a point", "× Embree 64", "SRR", "rel L2", "relit, mean", "relit, worst",
-              "claims")
+              "claims", "MB")
     lines = ["| " + " | ".join(titles) + " |", "|---" * len(titles) + "|"]
     chosen = [row for row in rows if np.isfinite(row["seconds"]) and (
         row["sweep"] == "base" or (row["sweep"] == "peers" and row["method"] not in METHODS))]
@@ -39,6 +39,8 @@ def summary(rows: list[chart_draw.Row]) -> str:
         cells += [f"{np.median([row[name] for row in own]):.3g}" if np.isfinite(own[0][name]) else ""
                   for name in ("ratio", "srr", "rel_l2", "relit_mean", "relit_worst")]
         cells.append(f"{np.median(claims):.3g}" if claims else "")
+        held = [row["memory_mb"] for row in own if isinstance(row["memory_mb"], float | int)]
+        cells.append(f"{np.median(held):.0f}" if held else "")
         lines.append(f"| {method} | {rays or ''} | {len(own)} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 

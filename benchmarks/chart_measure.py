@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from ambient import cycles_openness
 from memory import peak
-from meshes import FOLDER, knot, read
+from meshes import FOLDER, named
 from numpy.typing import NDArray
 from peers import Open3D, Trimesh
 from table import machine
@@ -91,13 +91,6 @@ def quick_cases() -> list[Case]:
         (1000, "scale", "scale"))]
 
 
-def _mesh(name: str) -> TriangleMesh:
-    """The mesh of a case."""
-    if name.startswith("knot "):
-        return TriangleMesh.from_triangles(*knot(int(name.split()[1])))
-    return read(FOLDER / "validation" / f"{name}.ply")
-
-
 def _settings(case: Case, points: int) -> list[Setting]:
     """What a case measures, each once."""
     threads = default_threads()
@@ -139,7 +132,7 @@ def _with_peers(mesh: TriangleMesh, ours: Bake) -> Bake:
 
 def _warm_peers(settings: Sequence[Setting]) -> None:
     """Run each peer once on a small knot, so that no time has its import."""
-    bake = _with_peers(_mesh("knot 100"), compare.vertex_bake(_mesh("knot 100")))
+    bake = _with_peers(named("knot 100"), compare.vertex_bake(named("knot 100")))
     for name in (*PEERS, CYCLES):
         with suppress(UserError):
             methods.run(bake(next(setting for setting in settings if setting.method == name), 0))
@@ -166,7 +159,7 @@ def measure(case: Case, lights: list[NDArray], only: frozenset[str] = frozenset(
     only: methods of the table. If that is not all, the others and the peers are there already; the plain bake is run
     beside them for the ratio, and its rows are left out.
     """
-    mesh = _mesh(case.mesh)
+    mesh = named(case.mesh)
     note = ""
     bake = compare.vertex_bake(mesh)
     points = mesh
@@ -187,10 +180,11 @@ def measure(case: Case, lights: list[NDArray], only: frozenset[str] = frozenset(
         settings = [setting for setting in settings if setting.method in only
                     or setting == compare.baseline(setting.order, setting.threads)]
     memory: dict[str, dict[str, float] | str] = {}
-    if case.sweep == "scale":  # first, so that what the machine has no room for is not tried here
+    if case.sweep == "scale" or (case.sweep == "base" and not case.quick):
+        # first, so that what the machine has no room for is not tried here
         for name in dict.fromkeys(setting.method for setting in settings if setting.method in only):
             rays = compare.BASELINE_RAYS if methods.METHODS[name].traces else None
-            memory[name] = peak(name, int(case.mesh.split()[1]), ORDER, rays)
+            memory[name] = peak(name, case.mesh, ORDER, rays)
             yield 0.0
         settings = [setting for setting in settings if not isinstance(memory.get(setting.method), str)]
     sees = methods.METHODS["embree"].sees

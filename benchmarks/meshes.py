@@ -61,3 +61,10 @@ def knot(count: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     p10, p11 = following * around + j, following * around + beside
     triangles = np.concatenate([np.stack([p00, p11, p01], -1), np.stack([p00, p10, p11], -1)]).reshape(-1, 3)
     return positions, triangles.astype(np.int32)
+
+
+def named(name: str) -> TriangleMesh:
+    """The stem of a file of ../shared/meshes/validation, or 'knot' and a number of vertices."""
+    if name.startswith("knot "):
+        return TriangleMesh.from_triangles(*knot(int(name.split()[1])))
+    return read(FOLDER / "validation" / f"{name}.ply")
