@@ -13,6 +13,7 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib import pyplot
 from matplotlib.axes import Axes
+from matplotlib.ticker import NullFormatter
 
 from neural_gash_addon.backend.compare import REFERENCE_RAYS, front
 from neural_gash_addon.backend.methods import METHODS
@@ -78,6 +79,9 @@ def _panel(axes: Axes, rows: Sequence[Row], error: str, spread: bool = True,
                      label=f"noise of the reference (2 x {REFERENCE_RAYS} rays)")
     axes.set_xscale("log")
     axes.set_yscale("log")
+    low, high = axes.get_xlim()
+    if high > 10 * low:  # powers of ten are enough; between them labels would lie over each other
+        axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("µs a point, whole job")
     axes.set_ylabel(LABELS[error])
     axes.grid(which="major", alpha=0.3)
