@@ -119,7 +119,7 @@ def draw(found: dict[str, dict[int, dict[str, float]]], path: Path) -> None:
                       label=stage, **style)
         axes.set(xscale="log", yscale="log", xlabel="vertices", title=name)
         axes.grid(alpha=0.3, which="both")
-        axes.legend()
+        axes.legend(loc="lower right", fontsize=8)
     panels[0].set_ylabel("milliseconds")
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
