@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .estimator import morton_order
-from .geometry import CORNER, POINT, TriangleMesh
+from .geometry import CORNER, POINT, TEXEL, TriangleMesh
 from .raycast import Geometry, used
 from .workers import product
 
 _LEAF = 64              # vertices of a ball that are compared with a plane at a time
-_MOST_PAIRS = 1e6       # of points and balls, 50 to 100 ms: what takes longer is not looked at, but traced
+# Pairs of points and balls, 50 to 100 ms: what takes longer is not looked at, but traced. Tiles of a texture have so
+# many points that a bake of them takes longer anyway.
+_MOST_PAIRS, _MOST_OF_TEXELS = 1e6, 5e8
 _LEVEL = 1e-6           # of the extent: heights over a plane that are rounding
 _FEW = 64               # normals that are compared with every vertex
 _SAME = 1e-7            # components of normals that do not differ by more are the same
@@ -54,7 +56,9 @@ def nothing_blocks(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> bool:
     normals = mesh.normals[lit]
     height = (normals * mesh.points[lit]).sum(1) + level
     flat = _of_few(normals, height, vertices)
-    return _none_above(normals, height, vertices) if flat is None else flat
+    if flat is not None:
+        return flat
+    return _none_above(normals, height, vertices, _MOST_OF_TEXELS if mesh.domain == TEXEL else _MOST_PAIRS)
 
 
 def convex(positions: NDArray, triangles: NDArray, rounding: float) -> bool:
@@ -130,11 +134,11 @@ def _of_few(normals: Floats, height: Floats, vertices: Floats) -> bool | None:
     return None
 
 
-def _none_above(normals: Floats, height: Floats, vertices: Floats) -> bool:
-    """Whether no vertex (V, 3) is above a plane with normal (n, 3) and height (n,). False where it takes long."""
+def _none_above(normals: Floats, height: Floats, vertices: Floats, most: float) -> bool:
+    """Whether no vertex (V, 3) is above a plane with normal (n, 3) and height (n,). False above `most` pairs."""
     vertices = vertices[morton_order(vertices)]
     balls = -(-len(vertices) // _LEAF)
-    if len(normals) * balls > _MOST_PAIRS:
+    if len(normals) * balls > most:
         return False
     vertices = np.concatenate([vertices, np.repeat(vertices[-1:], balls * _LEAF - len(vertices), 0)])
     leaves = vertices.reshape(balls, _LEAF, 3)

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The light-transport embedding: layers against loops over the paper's equations, and what holds for any room."""
-import sys
 
 import numpy as np
 import pytest
@@ -9,10 +8,8 @@ from scipy.spatial.transform import Rotation
 
 torch = pytest.importorskip("torch")
 
-from neural_gash_addon.backend import embedding, embedding_bake, serialise, weights  # noqa: E402
-from neural_gash_addon.backend import irradiance as tracing  # noqa: E402
-from neural_gash_addon.backend.errors import UserError  # noqa: E402
-from neural_gash_addon.backend.lit_points import LitPoints, lit_points  # noqa: E402
+from neural_gash_addon.backend import embedding, embedding_bake, serialise  # noqa: E402
+from neural_gash_addon.backend.lit_points import LitPoints  # noqa: E402
 from neural_gash_addon.backend.lit_scene import LitScene  # noqa: E402
 from neural_gash_addon.backend.methods import run  # noqa: E402
 from neural_gash_addon.backend.networks import embedding as networks  # noqa: E402
@@ -39,6 +36,27 @@ def room():
                          for each in (positions, normals, rng.random((count, 3)) * 0.8,
                                       np.where(rng.random((count, 1)) < 0.1, direct, 0), direct, indirect)))
     return points, tuple(each[-60:].astype(np.float32) for each in (positions, normals, direct))
+
+
+def box_room(outwards=False):
+    """A box of 4 by 3 by 2.5 metres, its sides inwards unless `outwards`, with a lamp below the ceiling."""
+    size = np.array([4, 3, 2.5])
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * size
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    triangles = triangles if outwards else triangles[:, ::-1]
+    lamp = np.array([[1.7, 1.2, 2.45], [1.7, 1.7, 2.45], [2.2, 1.7, 2.45], [2.2, 1.2, 2.45]])
+    positions = np.concatenate([corners, lamp])
+    triangles = np.concatenate([triangles, [[8, 9, 10], [8, 10, 11]]]).astype(np.int32)
+    albedo = np.full((14, 3), 0.6)
+    albedo[:2] = [0.8, 0.2, 0.1]
+    emission = np.zeros((14, 3))
+    emission[12:] = [20, 18, 15]
+    return LitScene(positions, triangles, albedo, emission)
+
+
+QUERIES = (np.array([[1.0, 1, 0], [3, 2, 0], [0, 1.5, 1], [2, 3, 2]]),
+           np.array([[0, 0, 1.0], [0, 0, 1], [1, 0, 0], [0, -1, 0]]))
 
 
 @pytest.fixture(scope="module")
@@ -361,112 +379,3 @@ def test_curves_are_shuffled_in_training_alone_and_by_the_seed(room):
     assert any(not torch.allclose(answers[0], other, rtol=1e-4) for other in answers[2:])
     for one, two in zip(network().parameters(), network().parameters(), strict=True):
         assert torch.equal(one, two)
-
-
-# --- the bake ---
-
-def box_room(outwards=False):
-    """A box of 4 by 3 by 2.5 metres, its sides inwards unless `outwards`, with a lamp below the ceiling."""
-    size = np.array([4, 3, 2.5])
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * size
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    triangles = triangles if outwards else triangles[:, ::-1]
-    lamp = np.array([[1.7, 1.2, 2.45], [1.7, 1.7, 2.45], [2.2, 1.7, 2.45], [2.2, 1.2, 2.45]])
-    positions = np.concatenate([corners, lamp])
-    triangles = np.concatenate([triangles, [[8, 9, 10], [8, 10, 11]]]).astype(np.int32)
-    albedo = np.full((14, 3), 0.6)
-    albedo[:2] = [0.8, 0.2, 0.1]
-    emission = np.zeros((14, 3))
-    emission[12:] = [20, 18, 15]
-    return LitScene(positions, triangles, albedo, emission)
-
-
-QUERIES = (np.array([[1.0, 1, 0], [3, 2, 0], [0, 1.5, 1], [2, 3, 2]]),
-           np.array([[0, 0, 1.0], [0, 0, 1], [1, 0, 0], [0, -1, 0]]))
-
-
-@pytest.fixture
-def shipped(monkeypatch):
-    """A small network without training as the one that ships, and few scene points."""
-    torch.manual_seed(0)
-    monkeypatch.setattr(embedding_bake, "network", lambda: networks.Embedding(TINY).eval())
-
-
-def test_a_bake_is_like_tracing_and_knows_how_far_off_it_is(shipped):
-    scene = box_room()
-    rng = np.random.default_rng(0)
-    points = rng.random((300, 3)) * [4, 3, 0] + [0, 0, 1e-9]
-    normals = np.tile([0, 0, 1.0], (300, 1))
-    found = run(embedding_bake.irradiance(scene, points, normals, threads=1))
-    truth = run(tracing.irradiance(scene, points, normals, 4096, threads=1))
-    assert found.values.shape == found.error.shape == (300, 3) and not found.notice
-    assert found.values.dtype == found.error.dtype == np.float32
-    off = np.square(found.values - truth.values).mean() ** 0.5
-    assert off < 0.2 * truth.values.mean()
-    assert 0.4 < off / np.square(found.error).mean() ** 0.5 < 1.5
-    again = run(embedding_bake.irradiance(scene, points, normals, threads=1, occluders=scene.occluders()))
-    np.testing.assert_array_equal(again.values, found.values)
-
-
-def test_a_room_modelled_inside_out_is_lit_within(shipped):
-    inside, outside = (run(embedding_bake.irradiance(box_room(way), *QUERIES, threads=1)).values
-                       for way in (False, True))
-    np.testing.assert_allclose(outside, inside, rtol=0.3)  # both are noisy; in the dark it would be zero
-    points = run(lit_points(box_room(True), box_room(True).occluders(), 512, threads=1))
-    assert (points.direct + points.indirect).any(1).mean() > 0.95
-    assert ((points.places - [2, 1.5, 1.25]) * points.normals).sum(1).max() < 1e-5  # all turned inwards
-
-
-def test_a_scene_in_which_nothing_shines_is_dark_and_says_so():
-    scene = box_room()
-    found = run(embedding_bake.irradiance(LitScene(scene.positions, scene.triangles, scene.albedo,
-                                                   np.zeros((14, 3))), *QUERIES))
-    assert not found.values.any() and not found.error.any() and found.notice == tracing.DARK
-
-
-def triangle(emission=1.0):
-    return LitScene(np.eye(3), np.array([[0, 1, 2]], np.int32), np.full((1, 3), 0.5), np.full((1, 3), emission))
-
-
-@pytest.mark.parametrize("scene", [
-    triangle(), LitScene(np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32), np.ones((1, 3)), np.ones((1, 3))),
-    LitScene(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 2], [1, 0, 2], [0, 1, 2.0]]),
-             np.array([[0, 1, 2], [3, 5, 4]], np.int32), np.ones((2, 3)), np.array([[0, 0, 0], [1, 2, 0.0]]))],
-    ids=["a triangle", "of no area", "two triangles"])
-def test_strange_scenes_have_numbers(shipped, scene):
-    points = np.array([[0.2, 0.2, 0], [0.2, 0.2, 1], [-5, 0, 0], [0.3, 0.3, 0.3]])
-    normals = np.array([[0, 0, 1.0], [0, 0, -1], [1, 0, 0], [0, 0, 0]])
-    found = run(embedding_bake.irradiance(scene, points, normals, threads=1))
-    assert np.isfinite(found.values).all() and np.isfinite(found.error).all() and (found.values >= 0).all()
-    assert not found.values[3].any()
-    assert run(embedding_bake.irradiance(scene, points[:0], normals[:0], threads=1)).values.shape == (0, 3)
-
-
-def test_points_within_solids_and_outside_have_numbers(shipped):
-    found = run(embedding_bake.irradiance(box_room(), QUERIES[0] + [0, 0, -0.5], QUERIES[1], threads=1))
-    assert np.isfinite(found.values).all() and np.isfinite(found.error).all()
-
-
-def test_bad_input_is_refused_in_a_sentence(shipped):
-    scene = box_room()
-    with pytest.raises(UserError, match="finite|number"):
-        run(embedding_bake.irradiance(scene, QUERIES[0] * np.nan, QUERIES[1]))
-    with pytest.raises(UserError, match=r"24\.0 m long.*up to 20 m"):
-        run(embedding_bake.irradiance(LitScene(scene.positions * 6, scene.triangles, scene.albedo, scene.emission),
-                                      *QUERIES))
-
-
-def test_weights_that_were_saved_are_those_that_are_asked(room, tmp_path, monkeypatch):
-    monkeypatch.setattr(weights, "FOLDER", tmp_path)
-    with pytest.raises(UserError, match=r"embedding\.safetensors' are missing"):
-        run(embedding_bake.irradiance(box_room(), *QUERIES))
-    made = network(networks.SMALL)
-    weights.save(tmp_path / weights.EMBEDDING, {name: value.numpy() for name, value in made.state_dict().items()})
-    np.testing.assert_array_equal(reflected(embedding_bake.network(), *room), reflected(made, *room))
-
-
-def test_without_torch_one_sentence_says_how_to_get_it(monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(UserError, match="needs PyTorch.*pip install torch"):
-        run(embedding_bake.irradiance(box_room(), *QUERIES))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from neural_gash_addon.backend import horizon
-from neural_gash_addon.backend.geometry import TriangleMesh
+from neural_gash_addon.backend.geometry import TEXEL, TriangleMesh
 from neural_gash_addon.backend.horizon import convex, nothing_blocks
 
 from .shapes import cube, grid, sphere, torus
@@ -100,6 +100,16 @@ def test_no_convex_mesh_is_too_large(monkeypatch):
     for smooth in (True, False):
         assert nothing_blocks(TriangleMesh.from_triangles(*sphere(5), smooth=smooth), [])
     assert not nothing_blocks(TriangleMesh.from_triangles(*holed()), [])
+
+
+def test_a_tile_of_texels_may_be_looked_at_for_longer(monkeypatch):
+    """Of a faceted ball: each texel lies in its face's plane, and no mesh is known by its edges from texels."""
+    faceted = TriangleMesh.from_triangles(*sphere(3), smooth=False)
+    tile = replace(faceted, domain=TEXEL)
+    monkeypatch.setattr(horizon, "_MOST_PAIRS", 10)
+    assert nothing_blocks(tile, [])
+    monkeypatch.setattr(horizon, "_MOST_OF_TEXELS", 10)
+    assert not nothing_blocks(tile, [])
 
 
 def test_normals_that_lean_too_far_are_found_on_a_convex_mesh():
