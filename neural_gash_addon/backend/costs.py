@@ -36,8 +36,8 @@ _LOOKS, _RUNS = 9, 3  # of a pilot, and of a method, whose median counts
 # Over what is expected, on this mesh, where the constants of `plan` are from, with one thread. (A smooth mesh: from
 # few of its points the others can be read.)
 _THERE = {"embree": 0.78, "hybrid": 0.57, "sparse": 0.10}
-# A bake that takes more than so many times what is expected, or less than the reciprocal, is off, mostly by its mesh. So
-# many in a row, all too long or all too short, are by the machine; twice as many each time that it was calibrated again.
+# A bake that takes so many times what is expected, or less than the reciprocal, is off, mostly by its mesh. So many in
+# a row, all too long or all too short, are by the machine; twice as many each time that it was calibrated again.
 _WRONG, _IN_A_ROW = 1.5, 5
 _MOST = 16.0         # factor, and its reciprocal
 _LONG = 0.02         # seconds: of less, the clock and other work are too much
