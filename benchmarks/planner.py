@@ -172,7 +172,7 @@ def expecting() -> Iterator[None]:
     with tempfile.TemporaryDirectory() as folder, patch.object(costs, "learn", learn), \
             patch.object(time, "perf_counter", time.process_time):
         costs.keep_in(Path(folder) / "costs.json")
-        methods.run(costs.calibrate(methods.candidates(), 1, 1 << 20))
+        methods.run(costs.ways(methods.candidates(), 1, 1 << 20))
         before = costs.factors(1)
         yield
     print("\n| method | plans | taken over expected: median | 10th percentile | 90th | factor at first | in the end |\n"

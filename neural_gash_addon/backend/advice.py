@@ -97,7 +97,7 @@ def _traced(points: TriangleMesh, scene: Occluders, order: int, rays: int, rng: 
             ) -> Generator[float, None, tuple[NDArray, NDArray]]:
     """Transfer of points, twice, with rays of their own. Yields progress."""
     with workers(threads, 2 * len(points.points) * rays) as pool:
-        blocked = yield from twice(points, scene, order, rays, int(rng.integers(2**31)), pool, threads)
+        *blocked, _ = yield from twice(points, scene, order, rays, int(rng.integers(2**31)), pool, threads)
     unshadowed = sh.cosine_lobe(points.normals, order)
     return unshadowed - blocked[0], unshadowed - blocked[1]
 

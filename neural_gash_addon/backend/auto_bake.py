@@ -18,8 +18,8 @@ from .geometry import TriangleMesh
 from .horizon import nothing_blocks
 from .merged import SAFE, Merged, dense, merged
 from .pilot import Pilot, look, looking
-from .plan import Candidate, Plan, Ways, cheapest, traced_bands, unshadowed, unshadowed_bands
-from .progress import scaled
+from .plan import Candidate, Plan, cheapest, traced_bands, unshadowed, unshadowed_bands
+from .progress import clocked, scaled
 from .raycast import Geometry, Occluders
 from .transfer import Transfer
 from .workers import default_threads, workers
@@ -48,21 +48,18 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     candidates: by name. With a number of rays there is nothing to plan but whether any is needed. What a method without
     rays gives is compared with the pilot, and traced where it is not within the tolerance.
     """
-    count = threads or default_threads()
-    if tolerance is not None:
-        yield from scaled(costs.calibrate(candidates, count, len(mesh.points)), 0, 0)
-    began = time.perf_counter()
-    ways = {name: costs.corrected([each.ways], count)[0] for name, each in candidates.items() if each.ways}
-    planning = planned(mesh, order, rays, tolerance, occluders, seed, threads, scene, whole, ways.values())
+    began, count = time.perf_counter(), threads or default_threads()
+    planning = planned(mesh, order, rays, tolerance, occluders, seed, threads, scene, whole, candidates)
     found = yield from scaled(planning, 0, _PILOT_SHARE)
     plan, pilot, order = found.plan, found.pilot, found.bands.order
 
     def work(plan: Plan) -> Generator[float, None, Transfer]:
         known = {"scene": found.scene, "pilot": pilot} if candidates[plan.method].traces else {}
-        began = time.perf_counter()
-        done = yield from candidates[plan.method].bake(mesh, order, rays=plan.rays, tolerance=plan.tolerance,
-                                                       occluders=occluders, seed=seed, threads=threads, **known)
-        costs.learn(plan, count, time.perf_counter() - began)
+        done, taken = yield from clocked(candidates[plan.method].bake(
+            mesh, order, rays=plan.rays, tolerance=plan.tolerance, occluders=occluders, seed=seed, threads=threads,
+            **known))
+        if not whole:  # the parts of one bake are planned alike
+            costs.learn(plan, count, taken)
         return done
 
     transfer = yield from scaled(work(plan), _PILOT_SHARE, 1 - _PILOT_SHARE)
@@ -73,6 +70,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
         error = pilot.error_of(transfer.coefficients)
         left = tolerance if whole else found.bands.left
         if error > left:
+            ways = yield from scaled(costs.ways(candidates, count, len(mesh.points)), _PILOT_SHARE, 0)
             plan = cheapest(pilot, len(mesh.points), left, [way for name, way in ways.items()
                                                             if candidates[name].traces], tolerance)
             transfer = yield from scaled(work(plan), _PILOT_SHARE, 1 - _PILOT_SHARE)
@@ -97,9 +95,9 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
 
 
 def planned(mesh: TriangleMesh, order: int, rays: int | None, tolerance: float | None, occluders: Sequence[Geometry],
-            seed: int, threads: int | None, scene: Occluders | None, whole: bool, ways: Ways
+            seed: int, threads: int | None, scene: Occluders | None, whole: bool, candidates: Mapping[str, Candidate]
             ) -> Generator[float, None, Planned]:
-    """Look, and choose among the ways; other arguments as `methods.bake`. Yields progress."""
+    """Look, and choose among the candidates; other arguments as `methods.bake`. Yields progress."""
     every = all_of(order, tolerance)
     if nothing_blocks(mesh, occluders):
         return Planned(Plan("analytic", reason="Nothing rises above any point's horizon: unshadowed is exact."), scene,
@@ -108,6 +106,7 @@ def planned(mesh: TriangleMesh, order: int, rays: int | None, tolerance: float |
         return Planned(Plan("embree", rays=rays, reason="A number of rays was asked for: they are traced from every "
                                                         "point."), scene, None, every)
     threads, points, enough = threads or default_threads(), len(mesh.points), tolerance
+    ways = list((yield from costs.ways(candidates, threads, points)).values())
 
     def without_rays(found: Pilot, safe: float = 1.0) -> tuple[Plan, Bands] | None:
         if not whole:
@@ -134,7 +133,8 @@ def planned(mesh: TriangleMesh, order: int, rays: int | None, tolerance: float |
 
 
 def enough_bands(mesh: TriangleMesh, order: int, tolerance: float, occluders: Sequence[Geometry], seed: int,
-                 threads: int | None, scene: Occluders, ways: Ways) -> Generator[float, None, Bands]:
+                 threads: int | None, scene: Occluders, candidates: Mapping[str, Candidate]
+                 ) -> Generator[float, None, Bands]:
     """The fewest bands that are enough where the points of a mesh are but some of many, which are baked in parts.
 
     Arguments as `planned`. Yields progress.
@@ -142,6 +142,7 @@ def enough_bands(mesh: TriangleMesh, order: int, tolerance: float, occluders: Se
     if nothing_blocks(mesh, occluders):
         return of_open_sky(order, tolerance)
     threads = threads or default_threads()
+    ways = (yield from costs.ways(candidates, threads, _MANY)).values()
     with workers(threads, looking(len(mesh.points), tolerance)) as pool:
         pilot = yield from look(mesh, scene, order, tolerance, seed, pool, threads)
-    return traced_bands(pilot, _MANY, order, tolerance, costs.corrected(ways, threads))[1]
+    return traced_bands(pilot, _MANY, order, tolerance, ways)[1]

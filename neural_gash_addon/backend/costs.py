@@ -13,8 +13,7 @@ import logging
 import os
 import platform
 import statistics
-import time
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from .exchange import atomic
 from .geometry import TriangleMesh
 from .pilot import Pilot, look, looking
 from .plan import Candidate, Plan, Way
+from .progress import clocked
 from .raycast import Occluders
 from .workers import workers
 
@@ -38,7 +38,7 @@ _LOOKS, _RUNS = 9, 3  # of a pilot, and of a method, whose median counts
 _THERE = {"embree": 0.78, "hybrid": 0.57, "sparse": 0.10}
 # A bake that takes so many times what is expected, or less than the reciprocal, is off, mostly by its mesh. So many in
 # a row, all too long or all too short, are by the machine; twice as many each time that it was calibrated again.
-_WRONG, _IN_A_ROW = 1.5, 5
+_WRONG, _IN_A_ROW, _MOST_AGAIN = 1.5, 5, 20
 _MOST = 16.0         # factor, and its reciprocal
 _LONG = 0.02         # seconds: of less, the clock and other work are too much
 _LOGGER = logging.getLogger(__name__)
@@ -54,9 +54,10 @@ class _Known:
     again: int = 0    # times that it was calibrated anew
 
     def __post_init__(self) -> None:
-        if not all(1 / _MOST <= factor <= _MOST for factor in self.factors.values()):
-            raise ValueError("factors out of range")
-        int(self.off), int(self.again)
+        if not (isinstance(self.calibrated, list) and type(self.off) is type(self.again) is int
+                and 0 <= self.again <= _MOST_AGAIN
+                and all(1 / _MOST <= factor <= _MOST for factor in self.factors.values())):
+            raise ValueError("numbers out of range")
 
 
 _file: Path | None = None
@@ -80,32 +81,31 @@ def factors(threads: int) -> dict[str, float]:
     return dict(_known[threads].factors) if threads in _known else {}
 
 
-def corrected(ways: Iterable[Way], threads: int) -> list[Way]:
-    """The same ways, whose plans take what they do on this machine."""
-    known = factors(threads)
+def ways(candidates: Mapping[str, Candidate], threads: int, points: int) -> Generator[float, None, dict[str, Way]]:
+    """What each candidate could do, whose plans take what they do on this machine.
 
-    def here(way: Way) -> Way:
-        def found(*seen: Any) -> list[Plan]:
-            return [replace(plan, seconds=plan.seconds * known.get(plan.method, 1.0)) for plan in way(*seen)]
-        return found
+    Where that is not known yet, a mesh is baked by each method that traces: half a second, once a machine and number of
+    threads, and a second more before the first mesh of many points. Yields progress.
 
-    return [here(way) for way in ways]
-
-
-def calibrate(candidates: Mapping[str, Candidate], threads: int, points: int) -> Generator[float, None, None]:
-    """Where it has not been done, bake a mesh by each method that traces: half a second, once a machine.
-
-    points: of the mesh that is to be baked. Yields progress.
+    points: of the mesh that is to be baked.
     """
-    if _file is None:
-        return
-    known = _known.setdefault(threads, _Known())
-    for size in (_SMALL, _LARGE) if points >= _DENSE else (_SMALL,):
-        if size not in known.calibrated:
-            for name, factor in (yield from _measured(candidates, threads, size)).items():
-                known.factors.setdefault(name, _within(factor))
-            known.calibrated.append(size)
-            _write()
+    if _file is not None:
+        known = _known.setdefault(threads, _Known())
+        for size in (_SMALL, _LARGE) if points >= _DENSE else (_SMALL,):
+            if size not in known.calibrated:
+                for name, factor in (yield from _measured(candidates, threads, size)).items():
+                    known.factors.setdefault(name, min(max(factor, 1 / _MOST), _MOST))
+                known.calibrated.append(size)
+                _write()
+    here = factors(threads)
+    return {name: _here(each.ways, here.get(name, 1.0)) for name, each in candidates.items() if each.ways}
+
+
+def _here(way: Way, factor: float) -> Way:
+    """The same, whose plans take so many times what they would."""
+    def found(*seen: Any) -> list[Plan]:
+        return [replace(plan, seconds=plan.seconds * factor) for plan in way(*seen)]
+    return found
 
 
 def learn(plan: Plan, threads: int, taken: float) -> None:
@@ -114,19 +114,15 @@ def learn(plan: Plan, threads: int, taken: float) -> None:
     All methods anew, and not the factor of that which was off: a busy machine is slower in all, and choices hang on how
     they compare.
     """
-    if _file is None or threads not in _known or not plan.seconds or max(plan.seconds, taken) < _LONG:
+    if plan.method not in factors(threads) or not plan.seconds or max(plan.seconds, taken) < _LONG:
         return
     known, ratio = _known[threads], taken / plan.seconds
     side = (ratio > _WRONG) - (ratio < 1 / _WRONG)
     before, known.off = known.off, known.off + side if side * known.off > 0 else side
     if abs(known.off) >= _IN_A_ROW << known.again:
-        _known[threads] = _Known(again=known.again + 1)
+        _known[threads] = _Known(again=min(known.again + 1, _MOST_AGAIN))
     if known.off != before:
         _write()
-
-
-def _within(factor: float) -> float:
-    return min(max(factor, 1 / _MOST), _MOST)
 
 
 def _measured(candidates: Mapping[str, Candidate], threads: int, size: int) -> Generator[float, None, dict[str, float]]:
@@ -149,10 +145,10 @@ def _measured(candidates: Mapping[str, Candidate], threads: int, size: int) -> G
         plans = candidate.ways(pilot, size, _TOLERANCE, "")
         ratios = []
         for seed in range(_RUNS if plans else 0):
-            began = time.perf_counter()
-            yield from candidate.bake(mesh, _ORDER, rays=plans[0].rays, tolerance=plans[0].tolerance, occluders=(),
-                                      seed=seed, threads=threads, scene=scene, pilot=pilot)
-            ratios.append((time.perf_counter() - began) / plans[0].seconds)
+            _, taken = yield from clocked(candidate.bake(
+                mesh, _ORDER, rays=plans[0].rays, tolerance=plans[0].tolerance, occluders=(), seed=seed,
+                threads=threads, scene=scene, pilot=pilot))
+            ratios.append(taken / plans[0].seconds)
         if ratios:
             found[name] = statistics.median(ratios) / _THERE.get(name, 1.0)
     return found
@@ -181,23 +177,27 @@ def _machine() -> str:
 
 def _read() -> dict[str, dict]:
     """What the file has, by machine; nothing where there is none, or of another version."""
-    if _file is None or not _file.exists():
+    if _file is None:
         return {}
     try:
         content = json.loads(_file.read_text(encoding="utf-8"))
         return dict(content["machines"]) if content["version"] == VERSION else {}
-    except (OSError, ValueError, KeyError, TypeError):
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         _LOGGER.warning("'%s' cannot be read; this machine will be calibrated anew.", _file)
         return {}
 
 
 def _write() -> None:
     """Keep it; where that fails, it is known until Blender is closed."""
-    assert _file is not None
+    file = _file
+    if file is None:  # the add-on was switched off meanwhile
+        return
     machines = {**_read(), _machine(): {str(threads): asdict(known) for threads, known in _known.items()}}
     try:
-        _file.parent.mkdir(parents=True, exist_ok=True)
-        with atomic(_file) as draft:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with atomic(file) as draft:
             draft.write_text(json.dumps({"version": VERSION, "machines": machines}, indent=2), encoding="utf-8")
     except OSError as error:
-        _LOGGER.warning("What bakes take on this machine cannot be kept in '%s': %s.", _file, error)
+        _LOGGER.warning("What bakes take on this machine cannot be kept in '%s': %s.", file, error)

@@ -29,7 +29,7 @@ RAYS_PER_JOB = 1 << 16  # about 15 ms of one thread: short enough to stop at onc
 # Directions up to which a job mixes points of all sets, if there are more rays than one job has, or not: with more, one
 # matrix product for all points of a set is quicker, with fewer, not having to go from set to set is.
 _MIXED, _MIXED_ONE_JOB = 16, 64
-_MIXED_RAYS_PER_JOB = 1 << 14  # with fewer, handing over to another thread costs more than it saves
+LEAST_RAYS_PER_JOB = 1 << 14  # with fewer, handing over to another thread costs more than it saves
 
 _TURNED_AT_ONCE = 2048  # points rotated by one worker at a time
 
@@ -110,13 +110,17 @@ class BlockedEstimator:
             sums[rows] += self._blocked_sums(points[rows], *tables)
         return sums
 
+    def jobs(self, points: NDArray, start: int, stop: int) -> int:
+        """Among how many threads `trace` can be spread, at most."""
+        return sum(1 for _ in self._jobs(points, start, stop))
+
     def _jobs(self, points: NDArray, start: int, stop: int) -> Iterator[tuple[NDArray, tuple[NDArray, NDArray]]]:
         """Rows of `points`, and what `_blocked_sums` wants of directions start..stop: of their set, or of all sets."""
         size = max(1, RAYS_PER_JOB // (stop - start))
         set_of_row = self._set_of_point[points]
         harmonics = self._harmonics(start, stop)
         if stop - start <= (_MIXED if len(points) * (stop - start) > RAYS_PER_JOB else _MIXED_ONE_JOB):
-            size = max(1, _MIXED_RAYS_PER_JOB // (stop - start))
+            size = max(1, LEAST_RAYS_PER_JOB // (stop - start))
             every = self._sets(stop)[:, start:stop].astype(np.float32)
             for part in np.array_split(np.arange(len(points)), -(-len(points) // size)):
                 yield part, (every, harmonics)

@@ -79,11 +79,6 @@ def candidates() -> dict[str, plan.Candidate]:
             if entry.ways or name == "analytic"}
 
 
-def ways() -> list[plan.Way]:
-    """What a plan chooses among."""
-    return [entry.ways for entry in METHODS.values() if entry.ways]
-
-
 METHODS: dict[str, Method] = {m.name: m for m in (
     Method("analytic", "Unshadowed", "Exact shading of the normals alone, without any shadows; instant",
            traces=False, bake=_analytic),

@@ -7,7 +7,6 @@ on from it: it need not look again at what the pilot saw.
 """
 from __future__ import annotations
 
-import time
 from collections.abc import Generator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -16,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import spherical_harmonics as sh
-from .estimator import MAX_RAYS, RATE, BlockedEstimator
+from .estimator import LEAST_RAYS_PER_JOB, MAX_RAYS, RATE, BlockedEstimator
 from .geometry import TriangleMesh
+from .progress import clocked
 from .raycast import Occluders
-from .workers import working
+from .workers import spread
 
 POINTS = 256                  # or a 16th of them all, if that is less; or a 256th, if that is more
 _FEWEST, _MOST = 128, 2048
@@ -81,7 +81,9 @@ class Pilot:
 
     def seconds(self, points: int, rays: float) -> float:
         """Of so many rays, or what takes as long, from each of some points."""
-        return self.ray * points * rays / working(self.threads, points * rays)
+        every = points * rays
+        among = min(self.threads, max(every / LEAST_RAYS_PER_JOB, 1)) if spread(self.threads, every) else 1
+        return self.ray * every / among
 
     def noise_of(self, rays: float) -> float:
         """The relative error of a plain bake with so many rays."""
@@ -105,23 +107,24 @@ def look(mesh: TriangleMesh, scene: Occluders, order: int, tolerance: float, see
     few = replace(mesh, points=mesh.points[points], normals=mesh.normals[points], clearance=mesh.clearance[points])
     rays = pilot_rays(tolerance)
     unshadowed = sh.cosine_lobe(few.normals, order)
-    began = time.perf_counter()
-    one, two = yield from twice(few, scene, order, rays, int(rng.integers(2**31)), pool, threads)
-    taken = (time.perf_counter() - began) * (threads if isinstance(pool, ThreadPoolExecutor) else 1)
-    ray = taken / (2 * (rays + _BESIDES) * max(wanted, 1))
+    (one, two, jobs), taken = yield from clocked(twice(few, scene, order, rays, int(rng.integers(2**31)), pool,
+                                                       threads))
+    among = min(threads, jobs) if isinstance(pool, ThreadPoolExecutor) else 1
+    ray = taken * among / (2 * (rays + _BESIDES) * max(wanted, 1))
     return _said((points, one, two), unshadowed, rays, ray, 2 * rays * wanted, threads)
 
 
 def twice(few: TriangleMesh, scene: Occluders, order: int, rays: int, seed: int, pool: Executor, threads: int
-          ) -> Generator[float, None, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """The blocked part (n, K) of the points of a mesh, twice, with independent rays. Yields progress."""
+          ) -> Generator[float, None, tuple[NDArray[np.float64], NDArray[np.float64], int]]:
+    """The blocked part (n, K) of the points of a mesh, twice, with independent rays; in how many jobs. Yields progress.
+    """
     rows = np.tile(np.arange(len(few.points)), 2)  # at once: what a trace costs at all is much, where points are few
     of = replace(few, points=few.points[rows], normals=few.normals[rows], clearance=few.clearance[rows])
     twins, every = BlockedEstimator(of, scene, order, seed, rays, _SETS, twins=True), np.arange(len(rows))
     sums = np.zeros((len(rows), sh.coefficient_count(order)))
     yield from twins.trace(pool, threads, every, 0, rays, sums)
     one, two = np.split(twins.turned_here(every, twins.means(every, sums, 0, rays)), 2)
-    return one, two
+    return one, two, twins.jobs(every, 0, rays)
 
 
 def _said(sample: tuple[NDArray, NDArray, NDArray], unshadowed: NDArray, rays: int, ray: float, traced: int,

@@ -2,6 +2,7 @@
 """Generators that yield their progress: parts of longer ones, and driven to their end."""
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Generator
 from typing import TypeVar
 
@@ -15,6 +16,23 @@ def scaled(work: Generator[float, None, Result], start: float, share: float) -> 
             yield start + share * next(work)
     except StopIteration as end:
         return end.value
+    finally:
+        work.close()
+
+
+def clocked(work: Generator[float, None, Result]) -> Generator[float, None, tuple[Result, float]]:
+    """Run some work, and tell the seconds that it took; not those in which it was not asked to go on."""
+    seconds = 0.0
+    try:
+        while True:
+            began = time.perf_counter()
+            try:
+                share = next(work)
+            finally:
+                seconds += time.perf_counter() - began
+            yield share
+    except StopIteration as end:
+        return end.value, seconds
     finally:
         work.close()
 

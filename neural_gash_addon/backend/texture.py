@@ -125,7 +125,8 @@ def bake(surface: Surface, method: str = "embree", order: int = 5, *, uv: NDArra
     if methods.METHODS[method].plans and tolerance is not None and not whole and sees:
         some = texel_points(surface, scattered(surface, _POINTS, np.random.default_rng([seed, 7])), normal_maps)
         scene = sees(some, occluders)
-        looking = enough_bands(some, order, tolerance, occluders, seed, threads, scene, methods.ways())
+        looking = enough_bands(some, order, tolerance, occluders, seed, threads, scene,
+                               methods.candidates())
         bands = yield from scaled(looking, _LAYOUT_SHARE, 0)
     left = tolerance if bands.order == order else max(bands.left, methods.MIN_TOLERANCE)
     rows = max(1, _TILE // side)

@@ -13,6 +13,7 @@ import bpy
 
 from ..backend.errors import UserError
 from ..backend.methods import METHODS, run
+from ..scene import machine
 from ..scene.read import make_applied_copy, refusal
 from . import state
 from .batch import Outcome, finish_batch, prepare_batch
@@ -171,11 +172,11 @@ def targets(context: bpy.types.Context) -> list[bpy.types.Object]:
 
 def _tiles(obj: bpy.types.Object) -> Path | None:
     """Where an extension may keep the tiles of a texture that is being baked; None where this is none."""
-    package = __package__.rpartition(".")[0]
-    if not package.startswith("bl_ext."):
+    folder = machine.folder()
+    if folder is None:
         return None
     name = hashlib.blake2b(f"{bpy.data.filepath}|{obj.name}".encode(), digest_size=8).hexdigest()
-    return Path(bpy.utils.extension_path_user(package, path="tiles", create=True)) / name
+    return folder / "tiles" / name
 
 
 def bake_refusal(context: bpy.types.Context) -> str:

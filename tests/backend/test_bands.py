@@ -12,6 +12,8 @@ from neural_gash_addon.backend.texture import alike, merged
 from .shapes import cube, sphere, torus
 from .test_plan_bounces import room
 
+WAYS = [each.ways for each in methods.candidates().values() if each.ways]
+
 
 def bake(mesh, order, tolerance=None, method="auto", **arguments):
     return methods.run(methods.bake(mesh, method, order, tolerance=tolerance, **arguments))
@@ -104,8 +106,8 @@ def test_what_is_left_is_met_by_tracing(ring, monkeypatch, method):
 
 def test_a_pilot_that_was_cut_is_one_of_the_lower_order(ring):
     mesh, _ = ring
-    found = methods.run(auto_bake.planned(mesh, 5, None, 0.01, [], 3, 1, None, False, methods.ways())).pilot
-    lower = methods.run(auto_bake.planned(mesh, 3, None, 0.01, [], 3, 1, None, False, methods.ways())).pilot
+    found = methods.run(auto_bake.planned(mesh, 5, None, 0.01, [], 3, 1, None, False, methods.candidates())).pilot
+    lower = methods.run(auto_bake.planned(mesh, 3, None, 0.01, [], 3, 1, None, False, methods.candidates())).pilot
     cut = found.to_order(3)
     for name in ("blocked", "most_blocked", "noise", "scale"):
         assert getattr(cut, name) == pytest.approx(getattr(lower, name), rel=1e-6)
@@ -115,7 +117,7 @@ def test_a_pilot_that_was_cut_is_one_of_the_lower_order(ring):
 
 def test_the_pilot_sees_each_band_as_a_reference_does(ring):
     mesh, (one, two) = ring
-    found = methods.run(auto_bake.planned(mesh, 5, None, 0.05, [], 0, 1, None, False, methods.ways())).pilot
+    found = methods.run(auto_bake.planned(mesh, 5, None, 0.05, [], 0, 1, None, False, methods.candidates())).pilot
     energy = (one * two).sum(0)
     for order in (1, 2, 3, 4):
         true = (energy[order ** 2:].sum() / energy.sum()) ** 0.5
@@ -197,12 +199,12 @@ def test_a_sequence_refuses_frames_of_another_order(tmp_path):
 
 def test_fewer_bands_are_taken_where_they_take_no_more_time_and_the_tolerance_has_room(ring):
     mesh, _ = ring
-    found = methods.run(auto_bake.planned(mesh, 5, None, 0.1, [], 0, 1, None, False, methods.ways())).pilot
+    found = methods.run(auto_bake.planned(mesh, 5, None, 0.1, [], 0, 1, None, False, methods.candidates())).pilot
     lowered = 0
     for points in (1000, 200_000):
         for tolerance in (0.5, 0.25, 0.2, 0.18, 0.15, 0.05):
-            chosen, kept = plan.traced_bands(found, points, 5, tolerance, methods.ways())
-            assert chosen.seconds <= plan.cheapest(found, points, tolerance, methods.ways()).seconds
+            chosen, kept = plan.traced_bands(found, points, 5, tolerance, WAYS)
+            assert chosen.seconds <= plan.cheapest(found, points, tolerance, WAYS).seconds
             assert kept.dropped ** 2 + (1 - kept.dropped ** 2) * kept.left ** 2 <= tolerance ** 2 * (1 + 1e-9)
             assert kept.dropped <= plan.bands.MOST_DROPPED * tolerance
             lowered += kept.order < 5

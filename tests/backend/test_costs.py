@@ -2,17 +2,18 @@
 """What methods take on this machine: calibrated once, refreshed where that proves wrong, and what plans make of it."""
 import json
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from neural_gash_addon.backend import costs, methods, metrics, pilot, plan
+from neural_gash_addon.backend import costs, methods, metrics, pilot, plan, progress
 from neural_gash_addon.backend.geometry import TriangleMesh
 from neural_gash_addon.backend.pilot import Pilot
 from neural_gash_addon.backend.raycast import Occluders
-from neural_gash_addon.backend.workers import workers, working
+from neural_gash_addon.backend.workers import spread, workers
 
-from .shapes import torus
+from .shapes import cube, torus
 
 
 class Clock:
@@ -50,7 +51,7 @@ class Machine:
 @pytest.fixture
 def clock(monkeypatch):
     made = Clock()
-    monkeypatch.setattr(costs, "time", made)
+    monkeypatch.setattr(progress, "time", made)
     return made
 
 
@@ -66,13 +67,12 @@ def file(tmp_path, monkeypatch):
 
 
 def factors(names, threads=1):
-    """What plans of 1 s become."""
-    ways = costs.corrected([lambda *_, name=name: [plan.Plan(name, seconds=1.0)] for name in names], threads)
-    return [way(None, 1, 0.1, "")[0].seconds for way in ways]
+    """What is known of some methods."""
+    return [costs.factors(threads).get(name, 1.0) for name in names]
 
 
 def calibrated(candidates, threads=1, points=1000):
-    methods.run(costs.calibrate(candidates, threads, points))
+    return methods.run(costs.ways(candidates, threads, points))
 
 
 def test_a_machine_is_calibrated_once_and_it_is_kept(file, clock):
@@ -80,7 +80,10 @@ def test_a_machine_is_calibrated_once_and_it_is_kept(file, clock):
     calibrated(machine.candidates())
     assert machine.runs == {"slow": 3, "quick": 3}
     assert factors(["slow", "quick", "other"]) == pytest.approx([2.5, 0.5, 1])
-    calibrated(machine.candidates())
+    ways = calibrated(machine.candidates())
+    told = [way(None, 1000, 0.1, "") for way in ways.values()]
+    assert [(each.method, each.tolerance) for each, in told] == [("slow", 0.1), ("quick", 0.1)]
+    assert [each.seconds for each, in told] == pytest.approx([0.3 * 2.5, 0.3 * 0.5])
     costs.keep_in(file)  # as when Blender starts again
     assert factors(["slow", "quick"]) == pytest.approx([2.5, 0.5])
     calibrated(machine.candidates())
@@ -168,6 +171,12 @@ def test_without_a_file_nothing_is_calibrated_nor_learned(clock):
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"version": 1}', '{"version": 1, "machines": 5}',
                                      '{"version": 1, "machines": {"here": 5}}',
                                      '{"version": 1, "machines": {"here": {"1": {"factors": {"slow": 0}}}}}',
+                                     '{"version": 1, "machines": {"here": {"1": {"calibrated": null}}}}',
+                                     '{"version": 1, "machines": {"here": {"1": {"off": Infinity}}}}',
+                                     '{"version": 1, "machines": {"here": {"1": {"off": "0"}}}}',
+                                     '{"version": 1, "machines": {"here": {"1": {"again": -1}}}}',
+                                     '{"version": 1, "machines": {"here": {"1": {"again": 4000000000}}}}',
+                                     '{"version": 1, "machines": {"here": {"one": {}}}}', "[" * 200_000,
                                      '{"version": 1, "machines": {"here": {"1": {"factors": {"slow": "2"}}}}}'])
 def test_a_damaged_file_is_replaced(file, clock, caplog, monkeypatch, content):
     monkeypatch.setattr(costs, "_machine", lambda: "here")
@@ -219,7 +228,7 @@ def test_plans_follow_what_is_known_of_the_machine(file):
 
 def test_calibrating_can_be_cancelled_and_is_not_half_kept(file, clock):
     machine = Machine(clock, slow=2.5, quick=0.5)
-    work = costs.calibrate(machine.candidates(), 1, 1000)
+    work = costs.ways(machine.candidates(), 1, 1000)
     while machine.runs["slow"] < 1:
         next(work)
     work.close()
@@ -238,20 +247,67 @@ def test_the_mesh_that_is_baked_has_about_the_points_and_shadows():
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()  # closed
 
 
+def test_a_name_that_no_file_can_have_is_met_as_any_that_cannot_be_written(clock, caplog, tmp_path):
+    with caplog.at_level(logging.WARNING):
+        costs.keep_in(tmp_path / ("long" * 100) / "costs.json")
+        calibrated(Machine(clock, slow=2.5).candidates())
+    assert "cannot be kept" in caplog.text and factors(["slow"]) == pytest.approx([2.5])
+    costs.keep_in(None)
+
+
+def test_what_is_planned_in_parts_is_not_learned_from(file, monkeypatch):
+    told = []
+    monkeypatch.setattr(costs, "learn", lambda plan, threads, taken: told.append((plan.method, threads, taken)))
+    mesh = TriangleMesh.from_triangles(*torus(sections=64))
+    methods.run(methods.bake(mesh, "auto", tolerance=0.05, threads=1, whole=True))
+    assert not told
+    found = methods.run(methods.bake(mesh, "auto", tolerance=0.05, threads=1)).record
+    (method, threads, taken), = told
+    assert (method, threads) == (found.method, 1) and 0 < taken < found.seconds
+
+
+def test_where_nothing_blocks_or_rays_are_given_nothing_is_calibrated(file):
+    methods.run(methods.bake(TriangleMesh.from_triangles(*cube(), smooth=False), "auto", tolerance=0.05))
+    methods.run(methods.bake(TriangleMesh.from_triangles(*torus()), "auto", rays=8))
+    assert not file.exists()
+
+
+def test_time_between_the_steps_of_a_bake_does_not_count(clock):
+    def work():
+        for _ in range(5):
+            clock.now += 1
+            yield 0.5
+        return "done"
+
+    stepped = progress.clocked(work())
+    for _ in range(5):
+        next(stepped)
+        clock.now += 10
+    with pytest.raises(StopIteration) as end:
+        next(stepped)
+    assert end.value.value == ("done", 5)
+
+
 def test_rays_are_expected_to_be_shared_among_threads_where_they_are():
     found = Pilot(0.3, 0.4, 0.03, rays=64, scale=1.0, ray=1e-7, traced=1, sample=(), threads=4)
-    assert working(4, 100 * 10) == 1 and found.seconds(100, 10) == pytest.approx(1e-4)
-    assert working(4, 100_000 * 10) == 4 and found.seconds(100_000, 10) == pytest.approx(0.025)
+    assert not spread(4, 100 * 10) and found.seconds(100, 10) == pytest.approx(1e-4)
+    assert spread(4, 100_000 * 10) and found.seconds(100_000, 10) == pytest.approx(0.025)
+    many = replace(found, threads=64)  # of which few have any work
+    assert spread(64, 2 ** 15) and many.seconds(2 ** 15, 1) == pytest.approx(1e-7 * 2 ** 14)
 
 
-@pytest.mark.parametrize("threads, rays", [(1, 1e9), (2, 1), (2, 1e9)], ids=["one", "few rays", "two"])
-def test_a_pilot_says_what_a_ray_costs_on_one_thread(monkeypatch, threads, rays):
-    mesh = TriangleMesh.from_triangles(*torus())
+@pytest.mark.parametrize("threads, rays, among", [(1, 1e9, 1), (2, 1, 1), (2, 1e9, 2), (64, 1e9, "jobs")],
+                         ids=["one", "few rays", "two", "more than there is work for"])
+def test_a_pilot_says_what_a_ray_costs_on_one_thread(monkeypatch, threads, rays, among):
+    mesh = TriangleMesh.from_triangles(*torus(sections=200))
     scene = Occluders([(mesh.positions, mesh.triangles)], mesh.resolution)
-    monkeypatch.setattr(pilot, "time", Clock())
-    monkeypatch.setattr(pilot.time, "perf_counter", iter([0.0, 1.0]).__next__)
+    jobs = []
+    real = pilot.BlockedEstimator.jobs
+    monkeypatch.setattr(pilot.BlockedEstimator, "jobs", lambda *of: jobs.append(real(*of)) or jobs[-1])
+    monkeypatch.setattr(pilot, "clocked", lambda work: ((yield from work), 1.0))
     with workers(threads, rays) as pool:
-        found = methods.run(pilot.look(mesh, scene, 3, 0.05, 0, pool, threads))
-    each = pilot.sample_size(len(mesh.points)) * 2 * (pilot.pilot_rays(0.05) + 4)
-    assert found.ray * each == pytest.approx(2 if (threads, rays) == (2, 1e9) else 1)
+        found = methods.run(pilot.look(mesh, scene, 3, 0.01, 0, pool, threads))
+    each = pilot.sample_size(len(mesh.points)) * 2 * (pilot.pilot_rays(0.01) + 4)
+    assert 2 < jobs[0] < 64
+    assert found.ray * each == pytest.approx(jobs[0] if among == "jobs" else among)
     assert found.threads == found.to_order(2).threads == threads
