@@ -180,6 +180,7 @@ class Room:
         self.model, self._where = model.to(device), device
         self.radiance: Any = None if radiance is None else radiance.to(device)
         sizes = model.settings
+        self._points = points
         self._centre = np.mean(points.places, axis=0, dtype=np.float64)
         self._layout = embedding.layout(points.places, sizes.halvings, sizes.gathered, sizes.around)
         self._frame = Frame.of(self._tensor(points.places - self._centre), self._tensor(points.normals), self._layout)
@@ -225,8 +226,10 @@ class Room:
             near = near.to(self._where)
             places, facing = self._tensor(points[rows] - self._centre), self._tensor(normals[rows])
             straight = self._tensor(direct[rows].T) / unit.clamp_min(1e-30)
+            albedo = self._tensor(embedding.colours(points[rows], normals[rows], self._points.places,
+                                                    self._points.normals, self._points.albedo).T)
             with torch.no_grad():
-                found = self.model.decoder(self.codes, self._frame, places, facing, straight, near)
+                found = self.model.decoder(self.codes, self._frame, places, facing, albedo, straight, near)
                 out[rows] = (found * unit).T.cpu().numpy()
                 if order:
                     lobes = self._tensor(sh.cosine_lobe(normals[rows], self.radiance.order))
