@@ -39,6 +39,7 @@ PEER_RAYS = (4, 16, 64, 256)
 SAMPLE = 4096                    # points of a mesh, or all, at which errors are measured
 REFERENCE_SEED, SEED, ROUNDS = 77, 0, 3
 SIDE = 256                       # texels of a texture
+SWEEPS = "base", "peers", "threads", "orders", "texture"
 PEERS = {"trimesh": Trimesh, "open3d": Open3D}
 CYCLES = "cycles-ao"
 COLUMNS = ("points", "method", "order", "rays", "threads", "target", "seconds", "least", "most", "ratio", "runs", "srr",
@@ -61,10 +62,7 @@ class Case:
 
 
 def full_cases() -> list[Case]:
-    """The full run: three meshes of each category, and the knot at four sizes.
-
-    The three are the smallest, the median and the largest; the other sweeps are of the median one.
-    """
+    """The full run: every sweep on the smallest, the median and the largest mesh of each category; and the knot."""
     by_category: dict[str, list[tuple[int, str]]] = {}
     if (FOLDER / "MANIFEST.csv").is_file():
         with (FOLDER / "MANIFEST.csv").open(newline="") as file:
@@ -76,10 +74,10 @@ def full_cases() -> list[Case]:
     for category, found in sorted(by_category.items()):
         ordered = [stem for _, stem in sorted(found)]
         middle = ordered[len(ordered) // 2]
-        cases += [Case(stem, category, "base") for stem in dict.fromkeys((ordered[0], middle, ordered[-1]))]
-        cases += [Case(middle, category, sweep) for sweep in ("peers", "threads", "orders", "texture")]
+        cases += [Case(stem, category, sweep) for stem in dict.fromkeys((ordered[0], middle, ordered[-1]))
+                  for sweep in SWEEPS]
     if not cases:
-        cases = [Case("knot 8800", "procedural", sweep) for sweep in ("base", "peers", "threads", "orders", "texture")]
+        cases = [Case("knot 8800", "procedural", sweep) for sweep in SWEEPS]
     return cases + [Case(f"knot {size}", "scale", "scale") for size in (1_000, 10_000, 100_000, 1_000_000)]
 
 

@@ -7,7 +7,8 @@ plan never picks (gnn, embedding), and the three methods that measure (ray trace
 candidate meets it whose error (at most 2,000 of the points) is no more. The error is the product of the differences
 from two references of 2,048 rays with seeds of their own: so their noise, which a single one would add to what is
 measured, cancels. The planner's own time has everything in it: its pilot, its looks for what blocks and inside faces. A
-pilot may cost 50 ms or a tenth of the plan: the second regret leaves out so much of these.
+pilot may cost 50 ms or a tenth of the plan: the second regret leaves out so much of these. As in Blender, the machine
+is calibrated first, and what bakes take is learned from; at the end that is printed, and what they took of it.
 
 With --bands: the planner beside itself when it is held to bake all bands of --order, instead of the candidates; errors
 are those over all these bands.
@@ -16,8 +17,10 @@ from __future__ import annotations
 
 import argparse
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -28,9 +31,10 @@ import numpy as np
 from meshes import FOLDER, read
 from numpy.typing import NDArray
 
-from neural_gash_addon.backend import auto_bake, methods, sparse_bake
+from neural_gash_addon.backend import auto_bake, costs, methods, sparse_bake
 from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.geometry import TriangleMesh
+from neural_gash_addon.backend.plan import Plan
 from neural_gash_addon.backend.transfer import Transfer
 
 TOLERANCES = (0.2, 0.1, 0.05, 0.02, 0.01)
@@ -154,6 +158,31 @@ def regret(arguments: argparse.Namespace) -> None:
     print(f"\n{_missed(misses)} A lower order was baked in {lowered}.")
 
 
+@contextmanager
+def expecting() -> Iterator[None]:
+    """On a machine that is calibrated; prints at the end what bakes took of what plans expected."""
+    ratios: dict[str, list[float]] = {}
+    real = costs.learn
+
+    def learn(plan: Plan, threads: int, taken: float) -> None:
+        if plan.seconds:
+            ratios.setdefault(plan.method, []).append(taken / plan.seconds)
+        real(plan, threads, taken)
+
+    with tempfile.TemporaryDirectory() as folder, patch.object(costs, "learn", learn), \
+            patch.object(time, "perf_counter", time.process_time):
+        costs.keep_in(Path(folder) / "costs.json")
+        methods.run(costs.calibrate(methods.candidates(), 1, 1 << 20))
+        before = costs.factors(1)
+        yield
+    print("\n| method | plans | taken over expected: median | 10th percentile | 90th | factor at first | in the end |\n"
+          "|---|---|---|---|---|---|---|")
+    for method, values in sorted(ratios.items()):
+        few, half, many = np.percentile(values, (10, 50, 90))
+        print(f"| {method} | {len(values)} | {half:.2f} | {few:.2f} | {many:.2f} | {before.get(method, 1):.2f} | "
+              f"{costs.factors(1).get(method, 1):.2f} |")
+
+
 def bands(arguments: argparse.Namespace) -> None:
     """The planner beside itself held at the order."""
     print(f"Order {arguments.order}, one thread, processor seconds.\n\n| mesh | vertices | tolerance | all bands | s | "
@@ -200,7 +229,8 @@ def main() -> None:
     parser.add_argument("--tolerances", type=float, nargs="*", default=TOLERANCES)
     parser.add_argument("--bands", action="store_true", help="beside itself with all bands")
     arguments = parser.parse_args()
-    (bands if arguments.bands else regret)(arguments)
+    with expecting():
+        (bands if arguments.bands else regret)(arguments)
 
 
 if __name__ == "__main__":

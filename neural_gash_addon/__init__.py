@@ -5,9 +5,9 @@
 def _parts():
     """What registers, in order; imported late, so that the backend can be used without bpy."""
     from . import cli, ops, panels, properties
-    from .scene import lighting, live, staleness, viewport
+    from .scene import lighting, live, machine, staleness, viewport
 
-    return properties, ops, panels, live, lighting, viewport, staleness, cli
+    return machine, properties, ops, panels, live, lighting, viewport, staleness, cli
 
 
 def register() -> None:

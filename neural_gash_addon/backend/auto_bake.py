@@ -6,19 +6,19 @@ The record has a sentence for each choice: method and rays, order, domain, targe
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from . import advice
+from . import advice, costs
 from . import spherical_harmonics as sh
 from .bands import Bands, all_of, of_open_sky
 from .geometry import TriangleMesh
 from .horizon import nothing_blocks
 from .merged import SAFE, Merged, dense, merged
 from .pilot import Pilot, look, looking
-from .plan import Plan, Way, Ways, cheapest, traced_bands, unshadowed, unshadowed_bands
+from .plan import Candidate, Plan, Ways, cheapest, traced_bands, unshadowed, unshadowed_bands
 from .progress import scaled
 from .raycast import Geometry, Occluders
 from .transfer import Transfer
@@ -27,15 +27,6 @@ from .workers import default_threads, workers
 _PILOT_SHARE = 0.05  # of the progress
 _ROUGH = 0.05    # a tolerance that a look at a merged mesh, with the rays of twice that, is exact enough for
 _MANY = 1 << 18  # points that are baked at a time, where those that are looked at are but some of them
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A method that a plan may name."""
-
-    bake: Callable[..., Generator[float, None, Transfer]]
-    traces: bool          # takes rays or a tolerance, the scene and the pilot, and measures its error
-    ways: Way | None      # None: where nothing is traced
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,16 +48,22 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     candidates: by name. With a number of rays there is nothing to plan but whether any is needed. What a method without
     rays gives is compared with the pilot, and traced where it is not within the tolerance.
     """
+    count = threads or default_threads()
+    if tolerance is not None:
+        yield from scaled(costs.calibrate(candidates, count, len(mesh.points)), 0, 0)
     began = time.perf_counter()
-    planning = planned(mesh, order, rays, tolerance, occluders, seed, threads, scene, whole,
-                       [each.ways for each in candidates.values() if each.ways])
+    ways = {name: costs.corrected([each.ways], count)[0] for name, each in candidates.items() if each.ways}
+    planning = planned(mesh, order, rays, tolerance, occluders, seed, threads, scene, whole, ways.values())
     found = yield from scaled(planning, 0, _PILOT_SHARE)
     plan, pilot, order = found.plan, found.pilot, found.bands.order
 
     def work(plan: Plan) -> Generator[float, None, Transfer]:
         known = {"scene": found.scene, "pilot": pilot} if candidates[plan.method].traces else {}
-        return candidates[plan.method].bake(mesh, order, rays=plan.rays, tolerance=plan.tolerance, occluders=occluders,
-                                            seed=seed, threads=threads, **known)
+        began = time.perf_counter()
+        done = yield from candidates[plan.method].bake(mesh, order, rays=plan.rays, tolerance=plan.tolerance,
+                                                       occluders=occluders, seed=seed, threads=threads, **known)
+        costs.learn(plan, count, time.perf_counter() - began)
+        return done
 
     transfer = yield from scaled(work(plan), _PILOT_SHARE, 1 - _PILOT_SHARE)
     error = transfer.record.error_estimate
@@ -76,8 +73,8 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
         error = pilot.error_of(transfer.coefficients)
         left = tolerance if whole else found.bands.left
         if error > left:
-            plan = cheapest(pilot, len(mesh.points), left, [each.ways for each in candidates.values()
-                                                            if each.traces and each.ways], tolerance)
+            plan = cheapest(pilot, len(mesh.points), left, [way for name, way in ways.items()
+                                                            if candidates[name].traces], tolerance)
             transfer = yield from scaled(work(plan), _PILOT_SHARE, 1 - _PILOT_SHARE)
             error = transfer.record.error_estimate
     record = replace(transfer.record, plan=plan.reason).also(found.bands.reason).also(advice.domain(mesh))
@@ -147,4 +144,4 @@ def enough_bands(mesh: TriangleMesh, order: int, tolerance: float, occluders: Se
     threads = threads or default_threads()
     with workers(threads, looking(len(mesh.points), tolerance)) as pool:
         pilot = yield from look(mesh, scene, order, tolerance, seed, pool, threads)
-    return traced_bands(pilot, _MANY, order, tolerance, ways)[1]
+    return traced_bands(pilot, _MANY, order, tolerance, costs.corrected(ways, threads))[1]

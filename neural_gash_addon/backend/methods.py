@@ -70,9 +70,13 @@ def _embree_scene(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> Occluder
 
 
 def _auto(mesh: TriangleMesh, order: int, **arguments: Any) -> Baking:
-    return auto_bake.bake(mesh, order, **arguments, candidates={
-        name: auto_bake.Candidate(entry.bake, entry.traces, entry.ways) for name, entry in METHODS.items()
-        if entry.ways or name == "analytic"})
+    return auto_bake.bake(mesh, order, **arguments, candidates=candidates())
+
+
+def candidates() -> dict[str, plan.Candidate]:
+    """What a plan may name."""
+    return {name: plan.Candidate(entry.bake, entry.traces, entry.ways) for name, entry in METHODS.items()
+            if entry.ways or name == "analytic"}
 
 
 def ways() -> list[plan.Way]:

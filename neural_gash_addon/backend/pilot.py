@@ -2,14 +2,14 @@
 """The planner's pilot: a few points of a mesh, traced twice with rays of their own, and what they say about all.
 
 The product of the two traces gives the energy of transfer, of its bands and of what is blocked, without noise; their
-difference the noise of a number of rays; and the clock what a ray costs here and now, so no table of machine speeds is
-kept that could prove wrong. The bake that is then picked goes on from it: it need not look again at what the pilot saw.
+difference the noise of a number of rays; and the clock what a ray costs here and now. The bake that is then picked goes
+on from it: it need not look again at what the pilot saw.
 """
 from __future__ import annotations
 
 import time
 from collections.abc import Generator
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from . import spherical_harmonics as sh
 from .estimator import MAX_RAYS, RATE, BlockedEstimator
 from .geometry import TriangleMesh
 from .raycast import Occluders
+from .workers import working
 
 POINTS = 256                  # or a 16th of them all, if that is less; or a 256th, if that is more
 _FEWEST, _MOST = 128, 2048
@@ -40,17 +41,18 @@ class Pilot:
     noise: float      # relative to |T|, of so many
     rays: int         # rays
     scale: float      # root mean square of |T|
-    ray: float        # seconds of one
+    ray: float        # seconds of one, on one thread
     traced: int       # rays in all
     sample: tuple[NDArray, NDArray, NDArray]  # points (n,), and the blocked part (n, K) as each trace has it
     unshadowed: NDArray = field(default_factory=lambda: np.zeros((0, 0)))  # (n, K), of these points
+    threads: int = 1  # that a bake has
 
     def to_order(self, order: int) -> Pilot:
         """What it would be, had it been traced at a lower order."""
         points, one, two = self.sample
         terms = sh.coefficient_count(order)
         return _said((points, one[:, :terms], two[:, :terms]), self.unshadowed[:, :terms], self.rays, self.ray,
-                     self.traced)
+                     self.traced, self.threads)
 
     def beyond(self, order: int) -> tuple[float, float]:
         """What the bands from `order` on are of |T|, and a bound as of `most_blocked`; infinite in the dark."""
@@ -77,6 +79,10 @@ class Pilot:
         energy = float(self._energies()[0].sum())
         return float(max(((blocked - one) * (blocked - two)).sum(), 0.0) / energy) ** 0.5 if energy > 0 else np.inf
 
+    def seconds(self, points: int, rays: float) -> float:
+        """Of so many rays, or what takes as long, from each of some points."""
+        return self.ray * points * rays / working(self.threads, points * rays)
+
     def noise_of(self, rays: float) -> float:
         """The relative error of a plain bake with so many rays."""
         uneven = _UNEVEN if np.log2(rays) % 1 else 1.0
@@ -101,8 +107,9 @@ def look(mesh: TriangleMesh, scene: Occluders, order: int, tolerance: float, see
     unshadowed = sh.cosine_lobe(few.normals, order)
     began = time.perf_counter()
     one, two = yield from twice(few, scene, order, rays, int(rng.integers(2**31)), pool, threads)
-    ray = (time.perf_counter() - began) / (2 * (rays + _BESIDES) * max(wanted, 1))
-    return _said((points, one, two), unshadowed, rays, ray, 2 * rays * wanted)
+    taken = (time.perf_counter() - began) * (threads if isinstance(pool, ThreadPoolExecutor) else 1)
+    ray = taken / (2 * (rays + _BESIDES) * max(wanted, 1))
+    return _said((points, one, two), unshadowed, rays, ray, 2 * rays * wanted, threads)
 
 
 def twice(few: TriangleMesh, scene: Occluders, order: int, rays: int, seed: int, pool: Executor, threads: int
@@ -117,16 +124,17 @@ def twice(few: TriangleMesh, scene: Occluders, order: int, rays: int, seed: int,
     return one, two
 
 
-def _said(sample: tuple[NDArray, NDArray, NDArray], unshadowed: NDArray, rays: int, ray: float, traced: int) -> Pilot:
+def _said(sample: tuple[NDArray, NDArray, NDArray], unshadowed: NDArray, rays: int, ray: float, traced: int,
+          threads: int) -> Pilot:
     """What a sample says."""
     _, one, two = sample
     lights = ((unshadowed - one) * (unshadowed - two)).sum(1)
     energy = float(lights.sum())
     if energy <= 0:
-        return Pilot(np.inf, np.inf, np.inf, rays, 0.0, ray, traced, sample, unshadowed)
+        return Pilot(np.inf, np.inf, np.inf, rays, 0.0, ray, traced, sample, unshadowed, threads)
     noise = float(np.square(one - two).sum()) / 2 / energy
     return Pilot(*_part((one * two).sum(1), lights), noise ** 0.5, rays, (energy / len(one)) ** 0.5, ray, traced,
-                 sample, unshadowed)
+                 sample, unshadowed, threads)
 
 
 def _part(energies: NDArray, of: NDArray) -> tuple[float, float]:

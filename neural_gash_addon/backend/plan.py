@@ -15,7 +15,7 @@ pilot has built, and at each point it costs as much as 100 rays, which are more 
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 
 from . import bands
@@ -23,6 +23,7 @@ from .bands import Bands
 from .embree_bake import FIRST_RAYS
 from .hybrid_bake import FEWEST, expected_rays
 from .pilot import Pilot
+from .transfer import Transfer
 
 _SAFE = 1.1                  # what the pilot's noise may be too low by
 _MARGIN = 0.95               # of a tolerance, for who measures it: the measure is a little too low where it stops
@@ -45,12 +46,21 @@ class Plan:
     rays: int | None = None          # for every point, or
     tolerance: float | None = None   # to be met by measuring
     reason: str = ""                 # one sentence
-    seconds: float = 0.0             # expected
+    seconds: float = 0.0             # expected, but for what this machine has otherwise (`costs`)
 
 
 # of what a pilot saw, of how many points, with which tolerance, and how that is called: what could be done
 Way = Callable[[Pilot, int, float, str], list[Plan]]
 Ways = Iterable[Way]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A method that a plan may name."""
+
+    bake: Callable[..., Generator[float, None, Transfer]]
+    traces: bool          # takes rays or a tolerance, the scene and the pilot, and measures its error
+    ways: Way | None      # None: where nothing is traced
 
 
 def unshadowed_bands(found: Pilot, order: int, tolerance: float, safe: float = 1.0) -> tuple[Plan, Bands] | None:
@@ -107,7 +117,7 @@ def _unshadowed(found: Pilot) -> Plan:
 def embree_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[Plan]:
     """Rays until the tolerance is met, or so many as are enough."""
     def seconds(rays: float) -> float:
-        return _EMBREE_SECONDS + found.ray * points * (rays + _EMBREE_RAYS)
+        return _EMBREE_SECONDS + found.seconds(points, rays + _EMBREE_RAYS)
 
     measured = _MARGIN * tolerance
     out = [Plan("embree", tolerance=measured, seconds=seconds(max(found.needed_rays(measured), 2.0 * FIRST_RAYS)),
@@ -122,7 +132,7 @@ def embree_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[
 
 def hybrid_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[Plan]:
     """Few rays; of few points it asks no network, and what it does without takes longer than plain rays."""
-    seconds = _HYBRID_SECONDS + found.ray * points * (expected_rays(found, tolerance) + _HYBRID_RAYS)
+    seconds = _HYBRID_SECONDS + found.seconds(points, expected_rays(found, tolerance) + _HYBRID_RAYS)
     return [] if points < FEWEST else [Plan(
         "hybrid", tolerance=tolerance, seconds=seconds,
         reason=f"Few rays, averaged over neighbours by the network, are the quickest way to {said}.")]
@@ -131,7 +141,7 @@ def hybrid_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[
 def sparse_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[Plan]:
     """Some of many points."""
     measured = _MARGIN * tolerance
-    seconds = found.ray * points * (_SPARSE_RAYS + _SPARSE_SHARE * max(found.needed_rays(measured), 8.0))
+    seconds = found.seconds(points, _SPARSE_RAYS + _SPARSE_SHARE * max(found.needed_rays(measured), 8.0))
     return [] if points < SPARSE_POINTS else [Plan(
         "sparse", tolerance=measured, seconds=seconds,
         reason=f"{points:,} points are dense: some are traced, and the others read off them.")]
@@ -140,14 +150,14 @@ def sparse_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[
 def gnn_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[Plan]:
     """The network alone, where its usual error is within the tolerance; what it is here is measured afterwards."""
     return [] if _GNN_LEFT * found.blocked > tolerance else [Plan(
-        "gnn", seconds=found.ray * points * _GNN_RAYS, reason=f"The network alone is the quickest way to {said}.")]
+        "gnn", seconds=found.seconds(points, _GNN_RAYS), reason=f"The network alone is the quickest way to {said}.")]
 
 
 def embedding_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[Plan]:
     """Rays from scene points alone, if there is PyTorch, as `gnn_ways`."""
     if _EMBEDDING_LEFT * found.blocked > tolerance or importlib.util.find_spec("torch") is None:
         return []
-    return [Plan("embedding", seconds=_EMBEDDING_SECONDS + found.ray * points * _EMBEDDING_RAYS,
+    return [Plan("embedding", seconds=_EMBEDDING_SECONDS + found.seconds(points, _EMBEDDING_RAYS),
                  reason=f"Rays from some points, read by the embedding anywhere, are the quickest way to {said}.")]
 
 

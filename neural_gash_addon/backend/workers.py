@@ -40,9 +40,14 @@ class _Here(Executor):
 
 def workers(threads: int, rays: float = float("inf")) -> Executor:
     """Threads for so many rays, or what takes as long; the calling one where few would only wait for each other."""
-    if threads == 1 or rays * threads <= _FEW_RAYS:
+    if working(threads, rays) == 1:
         return _Here()
     return ThreadPoolExecutor(threads, thread_name_prefix="neural_gash")
+
+
+def working(threads: int, rays: float) -> int:
+    """Among how many threads `workers` spreads so many rays."""
+    return 1 if rays * threads <= _FEW_RAYS else threads
 
 
 def results(pool: Executor, threads: int, jobs: Iterable[tuple], work: Callable[..., Result]

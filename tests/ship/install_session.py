@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import sys
+from pathlib import Path
 
 import bpy
 
@@ -55,6 +56,9 @@ assert bpy.ops.neural_gash.bake() == {"FINISHED"}
 attributes = [name for name, _ in bpy.context.object.data.attributes.items() if name.startswith("_prt_")]
 assert attributes == [f"_prt_{i}" for i in range(4)], attributes
 assert json.loads(bpy.context.object.data["neural_gash"])["rays"] > 0  # whichever method was planned
+kept, = Path(bpy.utils.extension_path_user(ID)).glob("*.json")  # the first plan has calibrated this machine
+machine, = json.loads(kept.read_text())["machines"].values()
+assert all("embree" in known["factors"] for known in machine.values()), machine
 settings = bpy.context.scene.neural_gash
 settings.target, settings.side, settings.order, settings.bounces = "TEXTURE", 64, 3, 2
 assert bpy.ops.neural_gash.bake() == {"FINISHED"}   # with xatlas, and embreex's hits

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What methods take over what a plan expects: calibrated once on a machine, and again where that proves wrong.
+
+A pilot says what a ray costs here and now. What a method costs besides is in `plan`, in rays and seconds of the machine
+that they were found on, for meshes as they mostly are. Where another's processor, or the number of its threads, makes
+that more or less, a method takes a multiple of what is expected: so many times what it takes on that machine, with one
+mesh. These factors are kept in a file, if there is one (`keep_in`); without, all are 1.
+"""
+from __future__ import annotations
+
+import json
+import logging
+import os
+import platform
+import statistics
+import time
+from collections.abc import Generator, Iterable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .exchange import atomic
+from .geometry import TriangleMesh
+from .pilot import Pilot, look, looking
+from .plan import Candidate, Plan, Way
+from .raycast import Occluders
+from .workers import workers
+
+VERSION = 1          # raised whenever the constants of `plan` are others, or what is measured
+_SMALL, _LARGE = 1 << 13, 1 << 17  # points that are baked; so many for methods that are for dense meshes alone,
+_DENSE = 1 << 16     # before the first bake of so many
+_TOLERANCE, _ORDER = 0.1, 3
+_LOOKS, _RUNS = 9, 3  # of a pilot, and of a method, whose median counts
+# Over what is expected, on this mesh, where the constants of `plan` are from, with one thread. (A smooth mesh: from
+# few of its points the others can be read.)
+_THERE = {"embree": 0.78, "hybrid": 0.57, "sparse": 0.10}
+# A bake that takes so many times what is expected, or less than the reciprocal, is off, mostly by its mesh. So many in
+# a row, all too long or all too short, are by the machine; twice as many each time that it was calibrated again.
+_WRONG, _IN_A_ROW = 1.5, 5
+_MOST = 16.0         # factor, and its reciprocal
+_LONG = 0.02         # seconds: of less, the clock and other work are too much
+_LOGGER = logging.getLogger(__name__)
+
+
+@dataclass
+class _Known:
+    """Of this machine, with some number of threads."""
+
+    calibrated: list[int] = field(default_factory=list)  # sizes
+    factors: dict[str, float] = field(default_factory=dict)  # of methods
+    off: int = 0      # bakes in a row that took too long; below 0: that took too short
+    again: int = 0    # times that it was calibrated anew
+
+    def __post_init__(self) -> None:
+        if not all(1 / _MOST <= factor <= _MOST for factor in self.factors.values()):
+            raise ValueError("factors out of range")
+        int(self.off), int(self.again)
+
+
+_file: Path | None = None
+_known: dict[int, _Known] = {}  # by the number of threads
+
+
+def keep_in(file: Path | None) -> None:
+    """Calibrate this machine and keep that in a file, which need not be there yet; with None neither any longer."""
+    global _file
+    _file = file
+    _known.clear()
+    try:
+        _known.update({int(threads): _Known(**known) for threads, known in _read().get(_machine(), {}).items()})
+    except (AttributeError, TypeError, ValueError):
+        _LOGGER.warning("'%s' is damaged; this machine will be calibrated anew.", file)
+        _known.clear()
+
+
+def factors(threads: int) -> dict[str, float]:
+    """What is known of this machine with so many threads: what methods take over what is expected; of others, 1."""
+    return dict(_known[threads].factors) if threads in _known else {}
+
+
+def corrected(ways: Iterable[Way], threads: int) -> list[Way]:
+    """The same ways, whose plans take what they do on this machine."""
+    known = factors(threads)
+
+    def here(way: Way) -> Way:
+        def found(*seen: Any) -> list[Plan]:
+            return [replace(plan, seconds=plan.seconds * known.get(plan.method, 1.0)) for plan in way(*seen)]
+        return found
+
+    return [here(way) for way in ways]
+
+
+def calibrate(candidates: Mapping[str, Candidate], threads: int, points: int) -> Generator[float, None, None]:
+    """Where it has not been done, bake a mesh by each method that traces: half a second, once a machine.
+
+    points: of the mesh that is to be baked. Yields progress.
+    """
+    if _file is None:
+        return
+    known = _known.setdefault(threads, _Known())
+    for size in (_SMALL, _LARGE) if points >= _DENSE else (_SMALL,):
+        if size not in known.calibrated:
+            for name, factor in (yield from _measured(candidates, threads, size)).items():
+                known.factors.setdefault(name, _within(factor))
+            known.calibrated.append(size)
+            _write()
+
+
+def learn(plan: Plan, threads: int, taken: float) -> None:
+    """That a plan took so many seconds. Where that goes on to be far from what is expected, the next one calibrates.
+
+    All methods anew, and not the factor of that which was off: a busy machine is slower in all, and choices hang on how
+    they compare.
+    """
+    if _file is None or threads not in _known or not plan.seconds or max(plan.seconds, taken) < _LONG:
+        return
+    known, ratio = _known[threads], taken / plan.seconds
+    side = (ratio > _WRONG) - (ratio < 1 / _WRONG)
+    before, known.off = known.off, known.off + side if side * known.off > 0 else side
+    if abs(known.off) >= _IN_A_ROW << known.again:
+        _known[threads] = _Known(again=known.again + 1)
+    if known.off != before:
+        _write()
+
+
+def _within(factor: float) -> float:
+    return min(max(factor, 1 / _MOST), _MOST)
+
+
+def _measured(candidates: Mapping[str, Candidate], threads: int, size: int) -> Generator[float, None, dict[str, float]]:
+    """What methods that are ways to bake a mesh of so many points take, over what is expected; medians of some runs.
+
+    Of larger meshes only what no smaller one has.
+    """
+    mesh = _bumpy(size)
+    scene = Occluders([(mesh.positions, mesh.triangles)], mesh.resolution)
+    found: dict[str, float] = {}
+    with workers(threads, looking(size, _TOLERANCE)) as pool:
+        pilots: list[Pilot] = []
+        for seed in range(_LOOKS):
+            pilots.append((yield from look(mesh, scene, _ORDER, _TOLERANCE, seed, pool, threads)))
+    pilot = sorted(pilots, key=lambda each: each.ray)[_LOOKS // 2]
+    known = factors(threads)
+    for name, candidate in candidates.items():
+        if not candidate.traces or candidate.ways is None or name in known:
+            continue
+        plans = candidate.ways(pilot, size, _TOLERANCE, "")
+        ratios = []
+        for seed in range(_RUNS if plans else 0):
+            began = time.perf_counter()
+            yield from candidate.bake(mesh, _ORDER, rays=plans[0].rays, tolerance=plans[0].tolerance, occluders=(),
+                                      seed=seed, threads=threads, scene=scene, pilot=pilot)
+            ratios.append((time.perf_counter() - began) / plans[0].seconds)
+        if ratios:
+            found[name] = statistics.median(ratios) / _THERE.get(name, 1.0)
+    return found
+
+
+def _bumpy(size: int) -> TriangleMesh:
+    """A torus with bumps, of about so many points: a quarter of its light is blocked."""
+    across = int((size / 3) ** 0.5)
+    along = size // across
+    a, b = np.meshgrid(np.arange(along) * 2 * np.pi / along, np.arange(across) * 2 * np.pi / across, indexing="ij")
+    radius = 0.4 * (1 + 0.3 * np.sin(7 * a) * np.sin(3 * b))
+    out = 1 + radius * np.cos(b)
+    positions = np.stack([out * np.cos(a), out * np.sin(a), radius * np.sin(b)], 2).reshape(-1, 3)
+    rows, columns = np.arange(along)[:, None], np.arange(across)
+    corners = [((rows + i) % along * across + (columns + j) % across).ravel() for i, j in
+               ((0, 0), (1, 0), (1, 1), (0, 1))]
+    triangles = np.concatenate([np.stack([corners[0], corners[1], corners[2]], 1),
+                                np.stack([corners[0], corners[2], corners[3]], 1)])
+    return TriangleMesh.from_triangles(positions, triangles)
+
+
+def _machine() -> str:
+    """What tells this machine from another that has the same home folder."""
+    return f"{platform.node()}, {platform.machine()}, {os.cpu_count()} processors"
+
+
+def _read() -> dict[str, dict]:
+    """What the file has, by machine; nothing where there is none, or of another version."""
+    if _file is None or not _file.exists():
+        return {}
+    try:
+        content = json.loads(_file.read_text(encoding="utf-8"))
+        return dict(content["machines"]) if content["version"] == VERSION else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        _LOGGER.warning("'%s' cannot be read; this machine will be calibrated anew.", _file)
+        return {}
+
+
+def _write() -> None:
+    """Keep it; where that fails, it is known until Blender is closed."""
+    assert _file is not None
+    machines = {**_read(), _machine(): {str(threads): asdict(known) for threads, known in _known.items()}}
+    try:
+        _file.parent.mkdir(parents=True, exist_ok=True)
+        with atomic(_file) as draft:
+            draft.write_text(json.dumps({"version": VERSION, "machines": machines}, indent=2), encoding="utf-8")
+    except OSError as error:
+        _LOGGER.warning("What bakes take on this machine cannot be kept in '%s': %s.", _file, error)
