@@ -91,7 +91,7 @@ def load(path: Path, settings: Settings, share: float = 1.0) -> Sample:
     points, direct, looks = points[first], direct[first], looks[:, first]
     layout = embedding.layout(points[:, :3], settings.halvings, settings.gathered, settings.around)
     near = nearest_to(queries[:, :3], points[:len(layout.around), :3], settings.neighbours)
-    albedo = embedding.colours(queries[:, :3], queries[:, 3:6], points[:, :3], points[:, 3:6], points[:, 6:9])
+    albedo = embedding.colours(queries[:, :3], queries[:, 3:6], near[:, 0], layout.gathered, points)
     return Sample(points, direct, looks, queries, asked, truth, noise, layout, near.astype(np.int32), albedo,
                   near_mean(queries, points, looks.mean(0), 16))
 

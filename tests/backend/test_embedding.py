@@ -321,21 +321,28 @@ def test_lengths_are_read_by_one_fixed_scale_as_far_as_training_had_them(room):
 def test_the_albedo_of_a_query_is_that_of_what_it_lies_on(room):
     """Of the nearest scene point that faces as it does, not of another side of a thin wall; and it is read."""
     thin = np.array([[0, 0, 0.0], [0, 0, -0.01], [0.3, 0, 0], [0.3, 0, -0.01]])
-    facing, albedo = np.array([[0, 0, 1.0], [0, 0, -1]] * 2), np.arange(12).reshape(4, 3) / 12
-    asked = np.array([[0.02, 0, -0.006], [0.2, 0, -0.006], [0.2, 0, 0.5]])
-    found = embedding.colours(asked, np.array([[0, 0, 1.0], [0, 0, -1], [1, 0, 0]]), thin, facing, albedo)
-    np.testing.assert_allclose(found, albedo[[0, 3, 2]])  # none faces as the last
+    surface = np.concatenate([thin, [[0, 0, 1.0], [0, 0, -1]] * 2, np.arange(12).reshape(4, 3) / 12], 1)
+    asked = np.array([[0.02, 0, -0.006], [0.2, 0, -0.006], [0.2, 0, 0.5]]), [[0, 0, 1.0], [0, 0, -1], [1, 0, 0]]
+    found = embedding.colours(asked[0], np.array(asked[1]), np.zeros(3, int), np.array([[0, 1, 2, 3]]), surface)
+    np.testing.assert_allclose(found, surface[[0, 3, 2], 6:])  # none faces as the last
     points, queries = room
     places, normals = queries[:2]
-    near = cKDTree(points.places).query(places, 8)[1]
-    alike = [next((k for k in row if points.normals[k] @ normal > 0.5), row[0])
-             for row, normal in zip(near, normals, strict=True)]
-    np.testing.assert_array_equal(embedding.colours(places, normals, points.places, points.normals, points.albedo),
-                                  points.albedo[alike])
+    surface = np.concatenate([points.places, points.normals, points.albedo], 1)
+    layout = embedding.layout(points.places, TINY.halvings, 32, TINY.around)
+    codes = cKDTree(points.places[:38]).query(places)[1]
+    expected = []
+    for place, normal, code in zip(places, normals, codes, strict=True):
+        about = sorted(layout.gathered[code], key=lambda k: np.linalg.norm(points.places[k] - place))
+        expected.append(next((k for k in about if points.normals[k] @ normal > 0.5), about[0]))
+    found = embedding.colours(places, normals, codes, layout.gathered, surface)
+    np.testing.assert_array_equal(found, points.albedo[expected])
+    every = [next(k for k in row if points.normals[k] @ normal > 0.5)
+             for row, normal in zip(cKDTree(points.places).query(places, POINTS)[1], normals, strict=True)]
+    assert np.mean(np.array(expected) == every) > 0.95  # of all scene points hardly another one is
     model = network()
     whole = reflected(model, points, queries)
     made = embedding_bake.Room(model, points)
-    made._points = changed(points, albedo=1 - points.albedo)
+    made._surface = np.concatenate([points.places, points.normals, 1 - points.albedo], 1)
     assert np.abs(run(made.reflected(*queries)) / whole - 1).max() > 0.01
 
 
