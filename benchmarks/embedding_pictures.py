@@ -84,7 +84,7 @@ def main() -> None:
             every = np.concatenate([points.places, points.normals, points.albedo, points.emission], 1)
             sample = judging.Sample(every, points.direct, points.indirect[None], seen.queries, None, None, None,
                                     embedding.layout(points.places, sizes.halvings, sizes.gathered, sizes.around), None,
-                                    None)
+                                    None, None)
             return {name: direct + give(sample, np.arange(len(places))) for name, give in judging.BASELINES.items()}
 
         truth = traced(arguments.reference, 1)

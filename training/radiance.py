@@ -62,10 +62,10 @@ class Room:
             albedo, emission, direct, indirect = (_tensor(each.T) for each in (
                 sample.points[:, 6:9], np.pi * sample.points[:, 9:], sample.direct, sample.looks[number]))
             unit = level(indirect, self.frame.areas).clamp_min(1e-30)[:, None]
-            asked = _tensor(sample.asked.T) / unit
+            asked, albedo_asked = _tensor(sample.asked.T) / unit, _tensor(sample.albedo.T)
             with torch.no_grad():
                 codes = model.encoder(self.frame, albedo, emission / unit, direct / unit, indirect / unit)
-                light = model.decoder(codes, self.frame, self.places, self.normals, asked, self.near)
+                light = model.decoder(codes, self.frame, self.places, self.normals, albedo_asked, asked, self.near)
             self._looks[number] = unit, codes, indirect / unit, asked, light
         return self._looks[number]
 

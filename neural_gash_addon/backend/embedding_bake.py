@@ -180,6 +180,7 @@ class Room:
         self.model, self._where = model.to(device), device
         self.radiance: Any = None if radiance is None else radiance.to(device)
         sizes = model.settings
+        self._surface = np.concatenate([points.places, points.normals, points.albedo], 1)
         self._centre = np.mean(points.places, axis=0, dtype=np.float64)
         self._layout = embedding.layout(points.places, sizes.halvings, sizes.gathered, sizes.around)
         self._frame = Frame.of(self._tensor(points.places - self._centre), self._tensor(points.normals), self._layout)
@@ -221,12 +222,14 @@ class Room:
         shape, terms = np.zeros((len(points), order * order, 3), np.float32), order * order
         for start in range(0, len(points), QUERIES_AT_ONCE):
             rows = slice(start, start + QUERIES_AT_ONCE)
-            near = torch.from_numpy(nearest_to(points[rows], self._anchors, self.model.settings.neighbours))
-            near = near.to(self._where)
+            anchors = nearest_to(points[rows], self._anchors, self.model.settings.neighbours)
+            near = torch.from_numpy(anchors).to(self._where)
             places, facing = self._tensor(points[rows] - self._centre), self._tensor(normals[rows])
             straight = self._tensor(direct[rows].T) / unit.clamp_min(1e-30)
+            albedo = self._tensor(embedding.colours(points[rows], normals[rows], anchors[:, 0], self._layout.gathered,
+                                                    self._surface).T)
             with torch.no_grad():
-                found = self.model.decoder(self.codes, self._frame, places, facing, straight, near)
+                found = self.model.decoder(self.codes, self._frame, places, facing, albedo, straight, near)
                 out[rows] = (found * unit).T.cpu().numpy()
                 if order:
                     lobes = self._tensor(sh.cosine_lobe(normals[rows], self.radiance.order))

@@ -208,11 +208,11 @@ def test_the_decoder_is_vector_attention(room, model):
     codes = networks.Codes(*(torch.randn(2, 38, *size, generator=rng) for size in ((), (16,), (16,))), tuple(
         tuple(torch.randn(2, 2, 38, 16, generator=rng)) for _ in decoder.further))
     places, normals = (torch.from_numpy(each[:6]) for each in room[1][:2])
-    direct, near = torch.rand(2, 6, generator=rng), torch.randint(0, 38, (6, 5), generator=rng)
+    (albedo, direct), near = torch.rand(2, 2, 6, generator=rng), torch.randint(0, 38, (6, 5), generator=rng)
     expected = torch.empty(2, 6)
     for b in range(2):
         for j in range(6):
-            asks, kept = decoder.asks(direct[b, j].log1p()[None]).chunk(2)
+            asks, kept = decoder.asks(torch.stack([direct[b, j].log1p(), albedo[b, j]])).chunk(2)
             scores, values, own, light = [], [], [], []
             for k in near[j]:
                 lie = networks.relation(places[j:j + 1], normals[j:j + 1], frame.places[k][None, None],
@@ -236,7 +236,7 @@ def test_the_decoder_is_vector_attention(room, model):
                 latent = latent + layer.mix(layer.norms[1](latent))
             factor = (2 * torch.tanh(decoder.finish(latent) / 2)).exp()
             expected[b, j] = (torch.stack(own).softmax(0) * torch.stack(light)).sum() * factor
-    found = decoder(codes, frame, places, normals, direct, near)
+    found = decoder(codes, frame, places, normals, albedo, direct, near)
     np.testing.assert_allclose(found.detach(), expected.detach(), rtol=1e-4, atol=1e-5)
 
 
@@ -291,17 +291,59 @@ def test_light_is_linear_and_channels_are_apart(room, model):
     np.testing.assert_allclose(turned, whole[:, turn], rtol=1e-4)
 
 
-@pytest.mark.parametrize("matrix", [Rotation.random(random_state=1).as_matrix(), np.diag([-1, 1, 1]), 7 * np.eye(3)],
-                         ids=["turned", "mirrored", "larger"])
-def test_a_room_may_stand_anywhere_in_any_size(room, matrix):
+def moved(room, matrix, away=(40, -30, 8)):
+    """The room elsewhere, and what is asked of it."""
+    points, (places, normals, direct) = room
+    turn = matrix / np.cbrt(abs(np.linalg.det(matrix)))
+    return (changed(points, places=points.places @ matrix.T + away, normals=points.normals @ turn.T),
+            (places @ matrix.T + away, normals @ turn.T, direct))
+
+
+@pytest.mark.parametrize("matrix", [Rotation.random(random_state=1).as_matrix(), np.diag([-1, 1, 1])],
+                         ids=["turned", "mirrored"])
+def test_a_room_may_stand_anywhere(room, matrix):
     """Where all codes are of one patch; along other curves there would be other patches."""
     model = network(networks.Settings(**{**vars(TINY), "patch": 64}))
-    points, (places, normals, direct) = room
-    whole = reflected(model, points, (places, normals, direct))
-    turn = matrix / np.cbrt(abs(np.linalg.det(matrix)))
-    moved = changed(points, places=points.places @ matrix.T + [40, -30, 8], normals=points.normals @ turn.T)
-    asked = places @ matrix.T + [40, -30, 8], normals @ turn.T, direct
-    np.testing.assert_allclose(reflected(model, moved, asked), whole, rtol=2e-3)
+    np.testing.assert_allclose(reflected(model, *moved(room, matrix)), reflected(model, *room), rtol=2e-3)
+
+
+def test_lengths_are_read_by_one_fixed_scale_as_far_as_training_had_them(room):
+    """A larger room is another one; beyond what was trained with, rooms are as the largest, or the smallest."""
+    model = network(networks.Settings(**{**vars(TINY), "patch": 64}))
+    sizes = {size: reflected(model, *moved(room, size * np.eye(3), [0, 0, 0]))
+             for size in (1e-3, 0.01, 0.1, 0.15, 0.2, 2, 40)}
+    for one, other in ((1e-3, 0.01), (2, 40)):
+        np.testing.assert_allclose(sizes[one], sizes[other], rtol=2e-3)
+    for one, other in ((0.01, 0.1), (0.1, 0.15), (0.15, 0.2), (0.2, 2)):
+        assert np.abs(sizes[one] / sizes[other] - 1).max() > 0.005
+
+
+def test_the_albedo_of_a_query_is_that_of_what_it_lies_on(room):
+    """Of the nearest scene point that faces as it does, not of another side of a thin wall; and it is read."""
+    thin = np.array([[0, 0, 0.0], [0, 0, -0.01], [0.3, 0, 0], [0.3, 0, -0.01]])
+    surface = np.concatenate([thin, [[0, 0, 1.0], [0, 0, -1]] * 2, np.arange(12).reshape(4, 3) / 12], 1)
+    asked = np.array([[0.02, 0, -0.006], [0.2, 0, -0.006], [0.2, 0, 0.5]]), [[0, 0, 1.0], [0, 0, -1], [1, 0, 0]]
+    found = embedding.colours(asked[0], np.array(asked[1]), np.zeros(3, int), np.array([[0, 1, 2, 3]]), surface)
+    np.testing.assert_allclose(found, surface[[0, 3, 2], 6:])  # none faces as the last
+    points, queries = room
+    places, normals = queries[:2]
+    surface = np.concatenate([points.places, points.normals, points.albedo], 1)
+    layout = embedding.layout(points.places, TINY.halvings, 32, TINY.around)
+    codes = cKDTree(points.places[:38]).query(places)[1]
+    expected = []
+    for place, normal, code in zip(places, normals, codes, strict=True):
+        about = sorted(layout.gathered[code], key=lambda k: np.linalg.norm(points.places[k] - place))
+        expected.append(next((k for k in about if points.normals[k] @ normal > 0.5), about[0]))
+    found = embedding.colours(places, normals, codes, layout.gathered, surface)
+    np.testing.assert_array_equal(found, points.albedo[expected])
+    every = [next(k for k in row if points.normals[k] @ normal > 0.5)
+             for row, normal in zip(cKDTree(points.places).query(places, POINTS)[1], normals, strict=True)]
+    assert np.mean(np.array(expected) == every) > 0.95  # of all scene points hardly another one is
+    model = network()
+    whole = reflected(model, points, queries)
+    made = embedding_bake.Room(model, points)
+    made._surface = np.concatenate([points.places, points.normals, 1 - points.albedo], 1)
+    assert np.abs(run(made.reflected(*queries)) / whole - 1).max() > 0.01
 
 
 def points_of(array):
@@ -339,7 +381,8 @@ def asked(model, room):
                                                    points.indirect)]
     near = embedding.nearest_to(places, points.places[:38], model.settings.neighbours)
     return model.decoder(model.encoder(frame, *light), frame, torch.from_numpy(places), torch.from_numpy(normals),
-                         torch.from_numpy(direct).T, torch.from_numpy(near))
+                         torch.linspace(0, 1, 3 * len(places)).view(3, -1), torch.from_numpy(direct).T,
+                         torch.from_numpy(near))
 
 
 def test_every_weight_is_learned_from(room):

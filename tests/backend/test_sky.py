@@ -20,7 +20,7 @@ from neural_gash_addon.backend.progress import run  # noqa: E402
 from neural_gash_addon.backend.raycast import Occluders  # noqa: E402
 from neural_gash_addon.backend.sky_bake import ScenePoints, Sky, joined, split  # noqa: E402
 
-TINY = Settings(first=32, widths=(32,), hidden=16, halvings=(4,), patch=64)
+TINY = Settings(first=32, widths=(32,), hidden=16, patch=64)
 IDENTITY = np.eye(3)
 
 

@@ -94,7 +94,8 @@ def test_each_configuration_takes_a_step_of_each_phase_from_the_command_line(cac
                                                                              configuration):
     """The full one as large as it is, in tiny rooms and at few queries; where there is CUDA, there."""
     recipe = embedding.RECIPES[configuration]
-    assert recipe.phases[0].loss == "logarithms" and recipe.phases[-1].rooms * recipe.phases[-1].queries == 8192
+    assert recipe.phases[0].loss == "logarithms"
+    assert all(phase.rooms * phase.queries == 8192 for phase in recipe.phases)
     few = tuple(replace(phase, rooms=1, queries=40) for phase in recipe.phases)
     monkeypatch.setitem(embedding.RECIPES, configuration, replace(recipe, phases=few))
     monkeypatch.setattr(embedding, "HELD_OUT", 40)
@@ -219,7 +220,7 @@ def test_baselines_are_right_where_it_is_known():
     points = np.concatenate([places, -places / 2, np.full((1000, 3), 0.5), np.zeros((1000, 3))], 1).astype(np.float32)
     sample = embedding.Sample(points, np.full((1000, 3), 3.0), np.full((2, 1000, 3), 7.0), points[::50], None,
                               np.ones((20, 3)), np.zeros((20, 3)), embedding.embedding.layout(places, (2, 2), 6, 4),
-                              None, None)
+                              None, None, None)
     for name, give in embedding.BASELINES.items():
         expected = np.full((20, 3), 7.0 if "nearest" in name else 3.0)
         np.testing.assert_allclose(give(sample, np.arange(20)), expected, rtol=0.2, err_msg=name)

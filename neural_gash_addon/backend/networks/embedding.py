@@ -6,8 +6,10 @@ differs from the paper, and why (docs/embedding.md has more):
 - Scene points carry traced light: what comes straight from emitters, and a few paths of what was reflected. The network
   says how to average the latter over places, and how far the average is off.
 - All light is in units of its mean over the room, colour channels are separate items of a batch, and what is read of
-  geometry are distances in units of the codes' spacing and cosines: brighter, recoloured, moved, turned, mirrored or
-  larger rooms give the same answer by construction, where the paper leaves that to be learned.
+  geometry are areas, distances in units of the codes' spacing and cosines: brighter, recoloured, moved, turned or
+  mirrored rooms give the same answer by construction, where the paper leaves that to be learned.
+- Lengths are read by one fixed scale (its A.3), as areas of scene points; those that no training had are read as the
+  nearest that one had, so that a doll's house is a small room.
 - The transformer has no stages: its blocks may become wider, and all are of the same codes.
 - Its Point Transformer V3 finds a code's surroundings by sparse convolution; here a depthwise one over the nearest
   codes, its kernel a perceptron of how they lie.
@@ -23,6 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from .. import embedding
+from ..lit_points import DENSITY
 from ..serialise import CURVES
 
 HEAD = 32           # numbers of an attention head (Table 3: D / 32 heads)
@@ -32,6 +35,7 @@ _SHARP = (4.0, 1.0, 0.4, 0.1)  # of each at first: weight of the squared distanc
 _TURNED = 4.0       # at first: what a cosine of 0 between normals takes off the logarithm of a weight
 _FARTHEST = 2.0     # a factor on an average is between exp(-2) and exp(2)
 _LEAST = 1e-3       # of the mean spacing: points that coincide have none
+_AREAS = 2e-2, 4.0  # of scene points, in those of the usual density: beyond, no training had any
 
 
 @dataclass(frozen=True)
@@ -281,7 +285,7 @@ class Encoder(nn.Module):
 
     def forward(self, frame: Frame, albedo: Tensor, emission: Tensor, direct: Tensor, indirect: Tensor) -> Codes:
         """albedo, emission, direct, indirect: (B, M), the latter three in units of the level."""
-        size = (frame.areas / frame.areas.mean().clamp_min(1e-30)).clamp_min(1e-3).log().expand_as(albedo)
+        size = (frame.areas * DENSITY).clamp(*_AREAS).log().expand_as(albedo)
         near, weights = frame.gathered, self.pool(frame.lie(frame.gathered)).softmax(1)  # (m, k, POOLS)
         with torch.autocast(near.device.type, enabled=False):  # squares of bright light are beyond halves
             weights, gathered = weights.float(), indirect[:, near]
@@ -333,23 +337,24 @@ class Decoder(nn.Module):
         hidden = settings.hidden
         self.kernel = Kernel((1.0,))
         self.lie = _perceptron(RELATION, hidden, 2 * hidden)
-        self.asks = _perceptron(1, hidden, 2 * hidden)
+        self.asks = _perceptron(2, hidden, 2 * hidden)
         self.weigh = nn.Linear(hidden, 1 + hidden, bias=False)
         self.further = nn.ModuleList(Further(settings) for _ in range(settings.layers))
         self.finish = nn.Sequential(nn.LayerNorm(hidden), _silent(_perceptron(hidden, hidden, 1)))
 
-    def forward(self, codes: Codes, frame: Frame, places: Tensor, normals: Tensor, direct: Tensor, near: Tensor
-                ) -> Tensor:
+    def forward(self, codes: Codes, frame: Frame, places: Tensor, normals: Tensor, albedo: Tensor, direct: Tensor,
+                near: Tensor) -> Tensor:
         """(B, n) reflected light.
 
         Args:
-            places, normals: (n, 3) of queries. direct: (B, n) light straight from emitters, which tells what is in the
-                shade of something from what is beside it; as all light, in units of the level.
+            places, normals: (n, 3) of queries. albedo: (B, n).
+            direct: (B, n) light straight from emitters, which tells what is in the shade of something from what is
+                beside it; as all light, in units of the level.
             near: (n, k) the codes nearest to each.
         """
         lie = relation(places, normals, frame.places[near], frame.normals[near], frame.spacing[near])
         relates, offset = self.lie(lie).chunk(2, 2)
-        asks, latent = self.asks(direct.log1p()[..., None]).chunk(2, 2)                # (B, n, H)
+        asks, latent = self.asks(torch.stack([direct.log1p(), albedo], 2)).chunk(2, 2)  # (B, n, H)
         weights = self.weigh((codes.key[:, near] + relates + asks[:, :, None]).relu())  # (B, n, k, 1 + H)
         own = (weights[..., 0] + self.kernel(lie)[..., 0]).softmax(2)
         light = (own * codes.light[:, near]).sum(2)

@@ -36,7 +36,7 @@ from .embedding import (
     relation,
 )
 
-SKY = Settings(first=64, widths=(64, 64), hidden=32, halvings=(4,))  # two halvings were no better (docs/embedding.md)
+SKY = Settings(first=64, widths=(64, 64), hidden=32)
 _OWN = 2.0  # at first: logarithm of the weight of a point's own numbers beside each of the averages about its code
 SEEN = 4   # numbers of a scene point that do not turn: its size, the whole, how uneven, and that along the normal
 
