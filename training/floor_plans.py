@@ -40,7 +40,8 @@ def plan(rng: Rng) -> Plan:
                 own = high if rng.random() < 0.6 else rng.uniform(2.3, 3.2)
                 most = shared[1] - shared[0] - 0.1
                 wide = min(rng.uniform(0.8, 1.1) if rng.random() < 0.7 else rng.uniform(1.1, 2.5), most)
-                start = rng.uniform(shared[0] + 0.05, shared[1] - 0.05 - wide)
+                low = shared[0] + 0.05
+                start = rng.uniform(low, max(low, shared[1] - 0.05 - wide))  # as wide as can be, but for rounding
                 doors.append((_between(host[0][0], new, start, start + wide),
                               float(rng.uniform(1.95, min(own, host[1]) - 0.1))))
                 rooms.append(([new], own))

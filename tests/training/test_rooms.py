@@ -66,6 +66,12 @@ def test_the_same_seed_is_the_same_room(some):
     assert any(len(a.triangles) != len(some[0].triangles) for a in some[1:])
 
 
+@pytest.mark.parametrize("seed", [449, 3_000_006])
+def test_an_opening_may_be_as_wide_as_the_wall(seed):
+    """Rounding left less than no room to place it in."""
+    assert len(rooms.generate(seed).triangles) > 50
+
+
 def test_given_meshes_stand_in_rooms(tmp_path):
     trimesh = pytest.importorskip("trimesh")
     ring = trimesh.creation.annulus(0.2, 1, 0.5, sections=77)
