@@ -36,6 +36,7 @@ _LOOKS, _RUNS = 9, 3  # of a pilot, and of a method, whose median counts
 # Over what is expected, on this mesh, where the constants of `plan` are from, with one thread. (A smooth mesh: from
 # few of its points the others can be read.)
 _THERE = {"embree": 0.74, "hybrid": 0.57, "sparse": 0.10}
+_USUAL = 0.78        # of what `plan` says bakes take, in the median: a pilot's rays are fewer, and so dearer
 # A bake that takes so many times what is expected, or less than the reciprocal, is off, mostly by its mesh. So many in
 # a row, all too long or all too short, are by the machine; twice as many each time that it was calibrated again.
 _WRONG, _IN_A_ROW, _MOST_AGAIN = 1.5, 5, 20
@@ -98,7 +99,7 @@ def ways(candidates: Mapping[str, Candidate], threads: int, points: int) -> Gene
                 known.calibrated.append(size)
                 _write()
     here = factors(threads)
-    return {name: _here(each.ways, here.get(name, 1.0)) for name, each in candidates.items() if each.ways}
+    return {name: _here(each.ways, _USUAL * here.get(name, 1.0)) for name, each in candidates.items() if each.ways}
 
 
 def _here(way: Way, factor: float) -> Way:

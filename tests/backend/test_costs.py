@@ -83,7 +83,7 @@ def test_a_machine_is_calibrated_once_and_it_is_kept(file, clock):
     ways = calibrated(machine.candidates())
     told = [way(None, 1000, 0.1, "") for way in ways.values()]
     assert [(each.method, each.tolerance) for each, in told] == [("slow", 0.1), ("quick", 0.1)]
-    assert [each.seconds for each, in told] == pytest.approx([0.3 * 2.5, 0.3 * 0.5])
+    assert [each.seconds for each, in told] == pytest.approx([costs._USUAL * 0.3 * 2.5, costs._USUAL * 0.3 * 0.5])
     costs.keep_in(file)  # as when Blender starts again
     assert factors(["slow", "quick"]) == pytest.approx([2.5, 0.5])
     calibrated(machine.candidates())
