@@ -29,6 +29,7 @@ from neural_gash_addon.backend.exchange import atomic
 from neural_gash_addon.backend.geometry import TriangleMesh
 from neural_gash_addon.backend.progress import scaled
 from neural_gash_addon.backend.record import BakeRecord
+from neural_gash_addon.backend.texels import Surface
 from neural_gash_addon.backend.unwrap import unwrap
 from neural_gash_addon.backend.workers import default_threads
 
@@ -150,6 +151,16 @@ def without(blocks: Iterable[dict[str, Any]], method: str) -> list[dict[str, Any
     return [block for block in kept if block["rows"]]
 
 
+def _unwrapped(surface: Surface, side: int) -> tuple[NDArray, int]:
+    """UVs in a texture of so many texels a side; of many charts in one twice as large, or four times."""
+    try:
+        return methods.run(unwrap(surface, side=side)).uv, side
+    except UserError:  # they do not fit
+        if side >= 4 * SIDE:
+            raise
+        return _unwrapped(surface, 2 * side)
+
+
 def measure(case: Case, lights: list[NDArray], only: frozenset[str] = frozenset(methods.METHODS)
             ) -> Generator[float, None, dict[str, Any]]:
     """A block: where it was measured, and its rows in the order of COLUMNS.
@@ -164,8 +175,8 @@ def measure(case: Case, lights: list[NDArray], only: frozenset[str] = frozenset(
     if case.sweep == "texture":
         surface, side = surface_of(mesh), 64 if case.quick else SIDE
         began = time.perf_counter()
-        uv = methods.run(unwrap(surface, side=side)).uv
-        note = f"unwrap {time.perf_counter() - began:.2f} s"
+        uv, side = _unwrapped(surface, side)
+        note = f"{side} texels a side, unwrap {time.perf_counter() - began:.2f} s"
         points = texels_of(surface, uv, side)
 
         def bake(setting: Setting, seed: int) -> Generator[float, None, tuple[NDArray, BakeRecord | None]]:

@@ -184,7 +184,7 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
     gloss: BoolProperty(  # type: ignore[valid-type]
         name="Glossy", default=False, update=_gloss_changed,
         description="Show what the materials mirror of the light, by their roughness, on objects baked to textures "
-                    "without bounces and lamps")
+                    "without bounces")
     lobe: EnumProperty(  # type: ignore[valid-type]
         name="Lobe", description="How materials spread what they mirror, by their roughness", default=GGX,
         update=_gloss_changed,

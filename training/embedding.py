@@ -53,7 +53,7 @@ class Recipe:
     phases: tuple[Phase, ...]
 
 
-# 8,192 queries a step, as section 4. The small one takes an hour of one CPU core
+# 8,192 queries a step, as section 4. The small one takes three quarters of an hour of a CPU core
 RECIPES = {"small": Recipe(SMALL, (Phase("logarithms", 600, 2e-3, 4, 2048, 60),
                                    Phase("values", 800, 1e-3, 4, 2048, 80))),
            "full": Recipe(FULL, (Phase("logarithms", 2_000_000, 2e-4, 4, 2048, 10_000),))}

@@ -29,7 +29,7 @@ Indices = NDArray[np.int64]
 class Layout:
     """Neighbours of M scene points, of which the first m are codes.
 
-    All but the orders hold for the room turned, mirrored, moved or larger, too.
+    All but the orders hold for the room turned, mirrored or moved, too.
     """
 
     gathered: Indices           # (m, k) the points nearest to each code, itself first

@@ -9,7 +9,7 @@
 4. Each candidate is given a number of rays that meets the tolerance, and a time; the cheapest is taken. What the noise
    becomes with other rays, and what a hybrid or a sparse bake saves, follow laws measured on meshes (below).
 
-`gnn` and `embedding` are candidates that win nowhere that was looked at: what the former saves is the scene, which the
+`gnn` and `embedding` are candidates that hardly ever win: what the former saves is the scene, which the
 pilot has built, and at each point it costs as much as 100 rays, which are more exact; the latter costs more than that.
 """
 from __future__ import annotations

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The bake by the light-transport embedding (`embedding`): scene points are traced, all else is asked. Needs torch.
 
-Transfer has no size, so, unlike light in rooms, no scale is fixed: scenes are brought to one.
+Transfer has no size, so, unlike lengths in rooms, those of scenes are not read: they are brought to one size.
 """
 from __future__ import annotations
 
