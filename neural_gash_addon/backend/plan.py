@@ -35,7 +35,7 @@ _SPARSE_SHARE = 0.15         # of the points that it then traces, about
 _SPARSE_RAYS = 25.0          # what reconstruction costs at each point, in rays
 _GNN_RAYS, _EMBEDDING_RAYS = 100.0, 120.0  # what networks cost at each point, in rays,
 _EMBEDDING_SECONDS = 0.3     # and for its scene points;
-_GNN_LEFT, _EMBEDDING_LEFT = 0.4, 0.4  # their error as a part of shadows: the root of the SRR of their worst meshes
+_GNN_LEFT, _EMBEDDING_LEFT = 0.4, 0.4  # their error as a part of shadows: the root of an SRR that few meshes exceed
 
 
 @dataclass(frozen=True)
