@@ -121,7 +121,7 @@ class NeuralGashSettings(bpy.types.PropertyGroup):
                 "else paths"),
                (PATHS, "Path Tracing", "Paths from every point, as many as the tolerance asks for"),
                (NETWORK, "Network (PyTorch)", "Direct light is traced; what surfaces reflect is traced at some "
-                "thousand points, and a network says from them what it is anywhere. For rooms of up to 20 m")])
+                "thousand points, and a network says from them what it is anywhere. For rooms of up to 15 m")])
     target: EnumProperty(  # type: ignore[valid-type]
         name="Target", description="Where the bake is kept", default=VERTICES,
         items=[(AUTOMATIC, "Automatic", "Vertices; where the method is Automatic, too, and vertices would miss shadows "

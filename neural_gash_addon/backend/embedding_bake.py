@@ -157,9 +157,9 @@ def _share_off(found: NDArray, truth: Irradiance) -> float:
 def refuse_larger(places: NDArray) -> None:
     """Raises UserError where a room of places (..., 3) is larger than any that the network knows."""
     size = float(np.ptp(places.reshape(-1, 3), axis=0).max())
-    if size > embedding.EXTENT:
+    if size > embedding.LARGEST:
         raise UserError(f"The room is {size:.1f} m long, and the network knows rooms of up to "
-                        f"{embedding.EXTENT:.0f} m; bake it in parts, or choose another method.")
+                        f"{embedding.LARGEST:.0f} m; bake it in parts, or choose another method.")
 
 
 class Room:

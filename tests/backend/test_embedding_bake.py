@@ -84,7 +84,7 @@ def test_bad_input_is_refused_in_a_sentence(shipped):
     scene = box_room()
     with pytest.raises(UserError, match="finite|number"):
         run(embedding_bake.irradiance(scene, QUERIES[0] * np.nan, QUERIES[1]))
-    with pytest.raises(UserError, match=r"24\.0 m long.*up to 20 m"):
+    with pytest.raises(UserError, match=r"24\.0 m long.*up to 15 m"):
         run(embedding_bake.irradiance(LitScene(scene.positions * 6, scene.triangles, scene.albedo, scene.emission),
                                       *QUERIES))
 

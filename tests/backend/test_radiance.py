@@ -254,7 +254,7 @@ def test_bad_input_by_direction(shipped):
     assert found.shape.shape == (4, 9, 3) and not found.shape.any() and found.notice == tracing.DARK
     with pytest.raises(UserError, match="finite|number"):
         run(embedding_bake.irradiance(scene, base.QUERIES[0] * np.nan, base.QUERIES[1], order=3))
-    with pytest.raises(UserError, match=r"24\.0 m long.*up to 20 m"):
+    with pytest.raises(UserError, match=r"24\.0 m long.*up to 15 m"):
         run(embedding_bake.irradiance(LitScene(scene.positions * 6, scene.triangles, scene.albedo, scene.emission),
                                       *base.QUERIES, order=3))
     with pytest.raises(ValueError, match="order 6"):
