@@ -24,7 +24,7 @@ from .exchange import atomic
 from .geometry import TriangleMesh
 from .pilot import Pilot, look, looking
 from .plan import Candidate, Plan, Way
-from .progress import clocked
+from .progress import clocked, scaled
 from .raycast import Occluders
 from .workers import workers
 
@@ -86,7 +86,7 @@ def ways(candidates: Mapping[str, Candidate], threads: int, points: int) -> Gene
     """What each candidate could do, whose plans take what they do on this machine.
 
     Where that is not known yet, a mesh is baked by each method that traces: half a second, once a machine and number of
-    threads, and a second more before the first mesh of many points. Yields progress.
+    threads, and a second more before the first mesh of many points. Yields 0, many times.
 
     points: of the mesh that is to be baked.
     """
@@ -94,7 +94,8 @@ def ways(candidates: Mapping[str, Candidate], threads: int, points: int) -> Gene
         known = _known.setdefault(threads, _Known())
         for size in (_SMALL, _LARGE) if points >= _DENSE else (_SMALL,):
             if size not in known.calibrated:
-                for name, factor in (yield from _measured(candidates, threads, size)).items():
+                found = yield from scaled(_measured(candidates, threads, size), 0, 0)
+                for name, factor in found.items():
                     known.factors.setdefault(name, min(max(factor, 1 / _MOST), _MOST))
                 known.calibrated.append(size)
                 _write()

@@ -207,7 +207,9 @@ def test_where_nothing_can_be_written_it_is_known_all_the_same(file, clock, capl
 def test_the_methods_of_the_table_are_calibrated_by_the_first_plan(file):
     mesh = TriangleMesh.from_triangles(*torus(sections=64))
     reference = methods.run(methods.bake(mesh, "embree", rays=2048, seed=9)).coefficients
-    found = methods.run(methods.bake(mesh, "auto", tolerance=0.05, threads=1))
+    shares: list[float] = []
+    found = methods.run(methods.bake(mesh, "auto", tolerance=0.05, threads=1), shares.append)
+    assert shares.count(0.0) > 10 and shares == sorted(shares)
     known = json.loads(file.read_text())["machines"][costs._machine()]["1"]
     assert known["calibrated"] == [500]
     traced = {name for name, entry in methods.METHODS.items() if entry.traces and entry.ways}
