@@ -134,6 +134,19 @@ def tried(group: str, trial: Callable[[Scale], Pairs], scale: Scale, chosen: Seq
     return cells
 
 
+def cells_of_rooms(rooms: dict[str, Any]) -> list[Cell]:
+    """Lamps, of the methods that compute what they add: the network, as a bake has it, and paths."""
+    import trials_rooms  # needs torch, as whoever has rows of it did
+
+    calm = next((row for row in rooms.get("rows", []) if row["where"] == trials_rooms.CALM), None)
+    if calm is None:
+        return []
+    columns = {"embree": len(trials_rooms.COLUMNS) - 1, "embedding": 0}
+    return [Cell("light from within", row["where"], method, row["errors"][n], row["worst"][n], row["where"],
+                 row["errors"][n], calm["errors"][n], commit=rooms["commit"])
+            for row in rooms["rows"] if row is not calm for method, n in columns.items()]
+
+
 def noise(scale: Scale, chosen: Sequence[Setting]) -> list[dict[str, object]]:
     """Seeds: how far the true error spreads, and how near it is what the report claims.
 
@@ -301,6 +314,7 @@ def main() -> int:
             _save(arguments.out, results)
         rooms = trials_rooms.table(results.get("rooms", {}).get("rows", []))
     cells = [Cell(**cell) for _, trial in every for cell in results["trials"].get(trial.__name__, {}).get("cells", [])]
+    cells += cells_of_rooms(results.get("rooms", {})) if rooms else []
     texts = {"origin": origin(results), "table": table(cells),
              "noise": noise_table(results["noise"].get("rows", [])), "red": red_list(cells),
              "rooms": rooms}

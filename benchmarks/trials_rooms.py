@@ -25,6 +25,7 @@ NEAR = 64     # scene points of the mean
 QUERIES = 512
 PATHS = 128   # from a query, of path tracing beside it
 GREY, WHITE = (0.55, 0.55, 0.55), (0.75, 0.75, 0.75)
+CALM = "a furnished room"  # undisturbed
 COLUMNS = ("network, as a bake has it", "network alone", f"mean of {NEAR} nearest scene points", f"{PATHS} paths")
 
 
@@ -107,7 +108,16 @@ class Answers:
 
     def errors(self) -> list[float]:
         """Of COLUMNS."""
-        return [self.off(light) for light in (self.network, self.alone, self.mean, self.paths)]
+        return [self.off(light) for light in self._columns()]
+
+    def worst(self) -> list[float]:
+        """Of COLUMNS, of any query: how far it is off, over the root mean square of the truth."""
+        truth = self.truth.values
+        typical = float(np.square(truth).sum(1).mean()) ** 0.5
+        return [float(np.linalg.norm(light - truth, axis=1).max()) / typical for light in self._columns()]
+
+    def _columns(self) -> tuple[NDArray, ...]:
+        return self.network, self.alone, self.mean, self.paths
 
     def off(self, light: NDArray) -> float:
         """Error of light (n, 3)."""
@@ -129,7 +139,7 @@ def trials(scale: int = 1) -> dict[str, Callable[[], tuple[LitScene, NDArray]]]:
     tube = Part(place(shaded(), (2.5, 2, 1.4)), np.array(WHITE))
     glowing = Part(place(ball(0.13, 3), (2, 2, 0.13)), np.array(GREY), np.full(3, 6.0))
     return {
-        "a furnished room": lambda: found(furnished()),
+        CALM: lambda: found(furnished()),
         "the room beside the one with the lamp": lambda: found(
             rooms.assembled([*walls(TWO), bulb, block((1, 0.8, 1.2), (7.5, 2.6, 0))]), lambda all: all[:, 0] > 5.15),
         "in a gap of 3 cm below a block": lambda: found(
@@ -143,7 +153,7 @@ def trials(scale: int = 1) -> dict[str, Callable[[], tuple[LitScene, NDArray]]]:
 
 
 def tried(scale: int = 1) -> list[dict]:
-    """Of each trial: 'where', 'light' (mean, W/m²) and 'errors' (of COLUMNS).
+    """Of each trial: 'where', 'light' (mean, W/m²), 'errors' and 'worst' (of COLUMNS).
 
     Raises:
         UserError: no torch.
@@ -152,7 +162,8 @@ def tried(scale: int = 1) -> list[dict]:
     rows = []
     for name, scene_of in trials(scale).items():
         found = Answers(model, *scene_of())
-        rows.append({"where": name, "light": float(found.truth.values.mean()), "errors": found.errors()})
+        rows.append({"where": name, "light": float(found.truth.values.mean()), "errors": found.errors(),
+                     "worst": found.worst()})
     return rows
 
 

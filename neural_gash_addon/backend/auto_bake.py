@@ -69,7 +69,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     elif pilot is not None and tolerance is not None and not candidates[plan.method].traces:
         error = pilot.error_of(transfer.coefficients)
         left = tolerance if whole else found.bands.left
-        if error > left:
+        if error is None or error > left:
             ways = yield from scaled(costs.ways(candidates, count, len(mesh.points)), _PILOT_SHARE, 0)
             plan = cheapest(pilot, len(mesh.points), left, [way for name, way in ways.items()
                                                             if candidates[name].traces], tolerance)

@@ -33,7 +33,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
          pilot: Pilot | None = None, fewest: int = FEWEST) -> Generator[float, None, Transfer]:
     """Trace `mesh` against itself and `occluders`; arguments as `methods.bake`.
 
-    pilot: what is known beforehand. fewest: points baked twice, at least.
+    pilot: what is known beforehand; at its points the error is measured. fewest: points baked twice without, at least.
     """
     began = time.perf_counter()
     threads = threads or default_threads()
@@ -58,7 +58,9 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
             work = _trace_block(estimator, block, order, rays, None if scale is None or tolerance is None
                                 else (tolerance * scale) ** 2, pool, threads)
             coefficients[block], rays_of_point[block] = yield from scaled(work, 0.95 * done, 0.95 * share)
-        if len(lit):
+        if pilot is not None:
+            error = pilot.error_of(coefficients)
+        elif len(lit):
             work_error = _measured_error(mesh, scene, order, seed, coefficients, rays_of_point, lit, fewest, pool,
                                          threads)
             error, extra = yield from scaled(work_error, 0.95, 0.05)

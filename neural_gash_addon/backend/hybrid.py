@@ -95,6 +95,16 @@ def _turned(axes: NDArray, rows: NDArray) -> NDArray[np.float64]:
     return np.einsum("xy,yn->xn", axes, rows).T
 
 
+def levelled(blocked: NDArray, unshadowed: NDArray, sign: int) -> NDArray[np.float32]:
+    """Blocked part (n, K) less (sign -1) or plus (1) what it would be if as much of the sky were blocked evenly.
+
+    unshadowed: (n, K) of the same points. A neighbour that faces another way is so read as it would be here.
+    """
+    out = np.array(blocked, np.float32)
+    out[:, 1:] += sign * blocked[:, :1] * unshadowed[:, 1:] / np.float32(FULL)
+    return out
+
+
 def filtered(places: NDArray, normals: NDArray, orders: Sequence[NDArray | None], blocked: NDArray[np.float32],
              unshadowed: NDArray[np.float32], rays: int, network: Network, pool: Executor
              ) -> NDArray[np.float32]:

@@ -19,7 +19,7 @@ from . import hybrid_bake, methods
 from . import spherical_harmonics as sh
 from .coarsen import Coarsening, coarsened
 from .geometry import POINT, TriangleMesh
-from .hybrid import FULL
+from .hybrid import levelled
 from .raycast import Geometry
 
 COARSEST = 512         # vertices: fewer are no quicker, as what each call costs is more than they do
@@ -89,12 +89,10 @@ class Live:
         rows = np.arange(len(mesh.points))
         for level in steps:
             rows = rows[level.rows]
-        blocked = unshadowed[rows] - found
-        blocked[:, 1:] -= blocked[:, :1] * unshadowed[rows, 1:] / np.float32(FULL)
+        blocked = levelled(unshadowed[rows] - found, unshadowed[rows], -1)
         for level in reversed(steps):
             blocked = level.spread(blocked)
-        blocked[:, 1:] += blocked[:, :1] * unshadowed[:, 1:] / np.float32(FULL)
-        return unshadowed - blocked
+        return unshadowed - levelled(blocked, unshadowed, 1)
 
     def tried(self, mesh: TriangleMesh, occluders: Sequence[Geometry], seconds: float) -> list[LivePlan]:
         """Plans with what they take and how they err, tried on the mesh as it stands: from the coarsest level and the

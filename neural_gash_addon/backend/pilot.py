@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import spherical_harmonics as sh
-from .estimator import LEAST_RAYS_PER_JOB, MAX_RAYS, RATE, BlockedEstimator
+from .estimator import LEAST_RAYS_PER_JOB, MAX_RAYS, RATE, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
+from .hybrid import levelled
 from .progress import clocked
 from .raycast import Occluders
 from .workers import spread
@@ -24,11 +25,12 @@ from .workers import spread
 POINTS = 256                  # or a 16th of them all, if that is less; or a 256th, if that is more
 _FEWEST, _MOST = 128, 2048
 _NOISE, _NOISE_RAYS = 0.035, 64  # the noise of so many rays is no more on most meshes
-_LEAST_RAYS, _MOST_RAYS = 16, 128
+_LEAST_RAYS, _MOST_RAYS = 16, 256
 _SETS = 8
 _UNEVEN = 1.1                 # of the noise of rays that are no power of two, and so no whole net, to that of such
-_BESIDES = 4.0                # what a point costs besides its rays, in rays
+_BESIDES = 16.0               # what a point of these costs besides its rays, in rays
 _DARK = 1e-3                  # of the transfer in the open: less than this is as good as none
+_UNSEEN = 0.05                # of the noise: what differs less is not seen
 _SURE = 1.3                   # standard errors of a share that are added to it, to be above it in nine cases of ten
 
 
@@ -43,7 +45,9 @@ class Pilot:
     scale: float      # root mean square of |T|
     ray: float        # seconds of one, on one thread
     traced: int       # rays in all
-    sample: tuple[NDArray, NDArray, NDArray]  # points (n,), and the blocked part (n, K) as each trace has it
+    sample: tuple[NDArray, NDArray, NDArray]  # points (n,) along a curve, and the blocked part (n, K) as each trace has it
+    varies: float     # what is blocked, from one to the next, root mean square of |T|; less than is seen is what is seen
+    turns: float      # their normals, likewise
     unshadowed: NDArray = field(default_factory=lambda: np.zeros((0, 0)))  # (n, K), of these points
     threads: int = 1  # that a bake has
 
@@ -51,8 +55,8 @@ class Pilot:
         """What it would be, had it been traced at a lower order."""
         points, one, two = self.sample
         terms = sh.coefficient_count(order)
-        return _said((points, one[:, :terms], two[:, :terms]), self.unshadowed[:, :terms], self.rays, self.ray,
-                     self.traced, self.threads)
+        return _said((points, one[:, :terms], two[:, :terms]), self.turns, self.unshadowed[:, :terms], self.rays,
+                     self.ray, self.traced, self.threads)
 
     def beyond(self, order: int) -> tuple[float, float]:
         """What the bands from `order` on are of |T|, and a bound as of `most_blocked`; infinite in the dark."""
@@ -72,12 +76,15 @@ class Pilot:
         _, one, two = self.sample
         return (self.unshadowed - one) * (self.unshadowed - two), one * two
 
-    def error_of(self, coefficients: NDArray) -> float:
-        """The relative error of transfer (N, K) of all points, by these."""
+    def error_of(self, coefficients: NDArray) -> float | None:
+        """The relative L2 error of transfer (N, K) of all points, by these; None in the dark.
+
+        Both traces' noise is independent, so it cancels in the product.
+        """
         points, one, two = self.sample
         blocked = self.unshadowed - coefficients[points]
         energy = float(self._energies()[0].sum())
-        return float(max(((blocked - one) * (blocked - two)).sum(), 0.0) / energy) ** 0.5 if energy > 0 else np.inf
+        return float(max(((blocked - one) * (blocked - two)).sum(), 0.0) / energy) ** 0.5 if energy > 0 else None
 
     def seconds(self, points: int, rays: float) -> float:
         """Of so many rays, or what takes as long, from each of some points."""
@@ -87,8 +94,7 @@ class Pilot:
 
     def noise_of(self, rays: float) -> float:
         """The relative error of a plain bake with so many rays."""
-        uneven = _UNEVEN if np.log2(rays) % 1 else 1.0
-        return uneven * self.noise * (self.rays / rays) ** (RATE / 2)
+        return self.noise * noise_beside(self.rays, rays)
 
     def needed_rays(self, tolerance: float) -> float:
         """Rays of a plain bake that meet the tolerance."""
@@ -103,7 +109,8 @@ def look(mesh: TriangleMesh, scene: Occluders, order: int, tolerance: float, see
     lit = mesh.lit()
     rng = np.random.default_rng([seed, 5])
     wanted = sample_size(len(lit))
-    points = np.sort(rng.choice(lit, wanted, replace=False))
+    points = rng.choice(lit, wanted, replace=False)
+    points = points[morton_order(mesh.points[points])] if wanted else points
     few = replace(mesh, points=mesh.points[points], normals=mesh.normals[points], clearance=mesh.clearance[points])
     rays = pilot_rays(tolerance)
     unshadowed = sh.cosine_lobe(few.normals, order)
@@ -111,7 +118,8 @@ def look(mesh: TriangleMesh, scene: Occluders, order: int, tolerance: float, see
                                                        threads))
     among = min(threads, jobs) if isinstance(pool, ThreadPoolExecutor) else 1
     ray = taken * among / (2 * (rays + _BESIDES) * max(wanted, 1))
-    return _said((points, one, two), unshadowed, rays, ray, 2 * rays * wanted, threads)
+    turns = float(np.square(np.diff(few.normals, axis=0)).sum(1).mean()) ** 0.5 if wanted > 1 else 0.0
+    return _said((points, one, two), turns, unshadowed, rays, ray, 2 * rays * wanted, threads)
 
 
 def twice(few: TriangleMesh, scene: Occluders, order: int, rays: int, seed: int, pool: Executor, threads: int
@@ -127,17 +135,25 @@ def twice(few: TriangleMesh, scene: Occluders, order: int, rays: int, seed: int,
     return one, two, twins.jobs(every, 0, rays)
 
 
-def _said(sample: tuple[NDArray, NDArray, NDArray], unshadowed: NDArray, rays: int, ray: float, traced: int,
-          threads: int) -> Pilot:
+def noise_beside(rays: float, others: float) -> float:
+    """The noise of a plain bake with other rays, as a part of that with a power of two of them."""
+    uneven = _UNEVEN if np.log2(others) % 1 else 1.0
+    return float(uneven * (rays / others) ** (RATE / 2))
+
+
+def _said(sample: tuple[NDArray, NDArray, NDArray], turns: float, unshadowed: NDArray, rays: int, ray: float,
+          traced: int, threads: int) -> Pilot:
     """What a sample says."""
     _, one, two = sample
     lights = ((unshadowed - one) * (unshadowed - two)).sum(1)
     energy = float(lights.sum())
     if energy <= 0:
-        return Pilot(np.inf, np.inf, np.inf, rays, 0.0, ray, traced, sample, unshadowed, threads)
+        return Pilot(np.inf, np.inf, np.inf, rays, 0.0, ray, traced, sample, np.inf, turns, unshadowed, threads)
     noise = float(np.square(one - two).sum()) / 2 / energy
+    first, second = (np.diff(levelled(trace, unshadowed, -1), axis=0) for trace in (one, two))
+    apart = float((first * second).sum(dtype=np.float64)) * len(one) / max(len(one) - 1, 1) / energy
     return Pilot(*_part((one * two).sum(1), lights), noise ** 0.5, rays, (energy / len(one)) ** 0.5, ray, traced,
-                 sample, unshadowed, threads)
+                 sample, max(apart, _UNSEEN ** 2 * noise) ** 0.5, turns, unshadowed, threads)
 
 
 def _part(energies: NDArray, of: NDArray) -> tuple[float, float]:

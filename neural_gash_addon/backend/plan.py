@@ -25,15 +25,16 @@ from .hybrid_bake import FEWEST, expected_rays
 from .pilot import Pilot
 from .transfer import Transfer
 
-_SAFE = 1.1                  # what the pilot's noise may be too low by
-_MARGIN = 0.95               # of a tolerance, for who measures it: the measure is a little too low where it stops
-_FEW_RAYS = (4, 6, 8, 12, 16, 24, 32, 48)  # of plain bakes below what an adaptive one takes at least
-_EMBREE_SECONDS, _HYBRID_SECONDS = 1e-3, 5e-3  # what a bake costs at all,
-_EMBREE_RAYS, _HYBRID_RAYS = 6.0, 10.0  # and at each point besides its rays, in rays
+_SAFE = 1.06                 # what the pilot's noise may be too low by
+_FEW_RAYS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # of plain bakes; with more, not to take all alike saves more
+_EMBREE_SECONDS, _HYBRID_SECONDS = 5e-4, 1e-3  # what a bake costs at all,
+_PLAIN_RAYS, _EMBREE_RAYS, _HYBRID_RAYS = 3.0, 11.0, 8.0  # and at each point besides its rays, in rays
+_EMBREE_MORE = 1.07  # the rays of one to a tolerance beside those that are needed if all take as many
 SPARSE_POINTS = 1 << 16      # from which on a sparse bake is a candidate; below, too many are samples
-_SPARSE_SHARE = 0.15         # of the points that it then traces, about
-_SPARSE_RAYS = 25.0          # what reconstruction costs at each point, in rays
-_GNN_RAYS, _EMBEDDING_RAYS = 100.0, 120.0  # what networks cost at each point, in rays,
+_SPARSE_MARGIN = 0.95        # of a tolerance: what it measures is a little too low where it stops
+_SPARSE_SHARE = 0.16         # of the points that it then traces, about
+_SPARSE_RAYS = 28.0          # what reconstruction costs at each point, in rays
+_GNN_RAYS, _EMBEDDING_RAYS = 110.0, 130.0  # what networks cost at each point, in rays,
 _EMBEDDING_SECONDS = 0.3     # and for its scene points;
 _GNN_LEFT, _EMBEDDING_LEFT = 0.4, 0.4  # their error as a part of shadows: the root of an SRR that few meshes exceed
 
@@ -116,15 +117,12 @@ def _unshadowed(found: Pilot) -> Plan:
 
 def embree_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[Plan]:
     """Rays until the tolerance is met, or so many as are enough."""
-    def seconds(rays: float) -> float:
-        return _EMBREE_SECONDS + found.seconds(points, rays + _EMBREE_RAYS)
-
-    measured = _MARGIN * tolerance
-    out = [Plan("embree", tolerance=measured, seconds=seconds(max(found.needed_rays(measured), 2.0 * FIRST_RAYS)),
+    rays = max(_EMBREE_MORE * found.needed_rays(tolerance), 2.0 * FIRST_RAYS) + _EMBREE_RAYS
+    out = [Plan("embree", tolerance=tolerance, seconds=_EMBREE_SECONDS + found.seconds(points, rays),
                 reason=f"Rays from every point, more where shadows are harder, are the quickest way to {said}.")]
     enough = next((rays for rays in _FEW_RAYS if _SAFE * found.noise_of(rays) <= tolerance), None)
     if enough:
-        out.append(Plan("embree", rays=enough, seconds=seconds(enough),
+        out.append(Plan("embree", rays=enough, seconds=_EMBREE_SECONDS + found.seconds(points, enough + _PLAIN_RAYS),
                         reason=f"Shadows are {_percent(found.blocked)} of the whole, so {enough} rays a point are "
                                f"enough for {said}."))
     return out
@@ -132,15 +130,15 @@ def embree_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[
 
 def hybrid_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[Plan]:
     """Few rays; of few points it asks no network, and what it does without takes longer than plain rays."""
-    seconds = _HYBRID_SECONDS + found.seconds(points, expected_rays(found, tolerance) + _HYBRID_RAYS)
+    rays = expected_rays(found, points, tolerance) + _HYBRID_RAYS
     return [] if points < FEWEST else [Plan(
-        "hybrid", tolerance=tolerance, seconds=seconds,
+        "hybrid", tolerance=tolerance, seconds=_HYBRID_SECONDS + found.seconds(points, rays),
         reason=f"Few rays, averaged over neighbours by the network, are the quickest way to {said}.")]
 
 
 def sparse_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[Plan]:
     """Some of many points."""
-    measured = _MARGIN * tolerance
+    measured = _SPARSE_MARGIN * tolerance
     seconds = found.seconds(points, _SPARSE_RAYS + _SPARSE_SHARE * max(found.needed_rays(measured), 8.0))
     return [] if points < SPARSE_POINTS else [Plan(
         "sparse", tolerance=measured, seconds=seconds,

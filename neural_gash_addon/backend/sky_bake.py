@@ -19,7 +19,7 @@ from . import spherical_harmonics as sh
 from .bounce import Bounces, Reflection
 from .estimator import BlockedEstimator, morton_order
 from .geometry import CORNER, TEXEL, TriangleMesh
-from .hybrid import FULL
+from .hybrid import FULL, levelled
 from .nearest import nearest_to
 from .paper_bake import import_torch
 from .progress import run, scaled
@@ -30,7 +30,7 @@ from .transfer import Transfer
 from .workers import default_threads, workers
 
 POINTS, RAYS = 4096, 64        # scene points at least, and rays from each: noisy at one, and not over a neighbourhood
-MOST, ASKING = 16_384, 4       # and at most: one for so many points that ask, so that they are not most of the work
+MOST, DENSITY = 16_384, 2500   # and at most; so many to a square as wide as the scene is long
 BOUNCE_RAYS = 64               # from each scene point, for what bounces bring
 CHECKED, CHECKS = 128, 64      # points that are traced twice to know the error; rays of each
 QUERIES_AT_ONCE = 4096         # decoded together, so that memory does not grow with their number
@@ -51,19 +51,16 @@ class ScenePoints:
 
 def split(blocked: NDArray, normals: NDArray) -> NDArray[np.float32]:
     """A blocked part (N, K) as the share of the sky that is blocked, and how it differs from an even sky of it."""
-    return _with_even(blocked, normals, -1.0)
+    return _levelled(blocked, normals, -1)
 
 
 def joined(found: NDArray, normals: NDArray) -> NDArray[np.float32]:
     """The inverse of `split`."""
-    return _with_even(found, normals, 1.0)
+    return _levelled(found, normals, 1)
 
 
-def _with_even(values: NDArray, normals: NDArray, sign: float) -> NDArray[np.float32]:
-    out = np.array(values, np.float32)
-    even = sh.cosine_lobe(normals, sh.order_of(out.shape[1]))[:, 1:] / FULL
-    out[:, 1:] += sign * out[:, :1] * even
-    return out
+def _levelled(values: NDArray, normals: NDArray, sign: int) -> NDArray[np.float32]:
+    return levelled(values, sh.cosine_lobe(normals, sh.order_of(values.shape[1])), sign)
 
 
 def on_surface(mesh: TriangleMesh, count: int, seed: int) -> TriangleMesh:
@@ -71,8 +68,7 @@ def on_surface(mesh: TriangleMesh, count: int, seed: int) -> TriangleMesh:
 
     They face to the side that is shaded, where the mesh says which that is (`TEXEL` does not).
     """
-    corners = mesh.positions[mesh.triangles]
-    double = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    corners, double = _faces(mesh)
     sizes = np.linalg.norm(double, axis=1)
     places = normals = np.zeros((0, 3))
     if sizes.sum() > 0:
@@ -92,6 +88,18 @@ def on_surface(mesh: TriangleMesh, count: int, seed: int) -> TriangleMesh:
         places, normals = candidates[kept], facing[kept]
     return TriangleMesh(mesh.positions, mesh.triangles, places, normals, normals,
                         np.arange(len(places), dtype=np.int32), TEXEL, mesh.resolution)
+
+
+def count_of(mesh: TriangleMesh, occluders: Occluders) -> int:
+    """Scene points that a mesh wants, by its surface beside its extent, however it is cut into faces."""
+    area = float(np.linalg.norm(_faces(mesh)[1], axis=1).sum()) / 2
+    return int(np.clip(DENSITY * area * occluders.scale ** 2, POINTS, MOST))
+
+
+def _faces(mesh: TriangleMesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Corners (F, 3, 3), and normals (F, 3) twice as long as faces are large."""
+    corners = mesh.positions[mesh.triangles]
+    return corners, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def traced(points: TriangleMesh, occluders: Occluders, order: int, rays: int, seed: int, threads: int
@@ -241,8 +249,7 @@ def encoded(mesh: TriangleMesh, occluders: Sequence[Geometry]) -> Sky | None:
 
 def _encode(scene: Occluders, mesh: TriangleMesh, seed: int, threads: int) -> Generator[float, None, Sky | None]:
     model = network()
-    count = min(max(POINTS, len(mesh.points) // ASKING), MOST)
-    points = yield from scene_points(mesh, scene, count, seed=seed, threads=threads)
+    points = yield from scene_points(mesh, scene, count_of(mesh, scene), seed=seed, threads=threads)
     if not len(points.places):
         return None
     torch = import_torch("embedding")

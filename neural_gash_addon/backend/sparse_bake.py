@@ -22,7 +22,7 @@ from . import embree_bake
 from . import spherical_harmonics as sh
 from .estimator import MAX_RAYS, RATE, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
-from .hybrid import FULL
+from .hybrid import levelled
 from .pilot import Pilot
 from .progress import scaled
 from .raycast import Geometry, Occluders
@@ -126,7 +126,7 @@ class _Work:
         self._extent = 1.0 / scene.scale
         self._rng = np.random.default_rng([seed, 4])
         self.samples = np.zeros(0, np.int64)
-        self._values = np.zeros((0, sh.coefficient_count(order)), np.float32)  # blocked part, see `_levelled`
+        self._values = np.zeros((0, sh.coefficient_count(order)), np.float32)  # blocked part, see `levelled`
         self.rays, self.probes = 0, 0
 
     def refine(self, rays: int | None, tolerance: float | None, pilot: Pilot | None
@@ -188,12 +188,12 @@ class _Work:
     def _at(self, rows: NDArray, unshadowed: NDArray) -> NDArray[np.float32]:
         """Blocked part (n, K) at some points, reconstructed."""
         values = reconstructed(self._mesh.points, self._mesh.normals, self.samples, self._values, rows, self._extent)
-        return _levelled(values, unshadowed, 1)
+        return levelled(values, unshadowed, 1)
 
     def _sample(self, fresh: NDArray) -> Generator[float, None, None]:
         """Trace some points and add them to the samples."""
         blocked = yield from self._traced(fresh, self.rays)
-        values = _levelled(blocked.astype(np.float32), sh.cosine_lobe(self._mesh.normals[fresh], self._order), -1)
+        values = levelled(blocked.astype(np.float32), sh.cosine_lobe(self._mesh.normals[fresh], self._order), -1)
         samples = np.concatenate([self.samples, fresh])
         order = np.argsort(samples, kind="stable")
         self.samples, self._values = samples[order], np.concatenate([self._values, values])[order]
@@ -240,13 +240,3 @@ class _Work:
         sums = np.zeros((len(points), sh.coefficient_count(self._order)))
         yield from estimator.trace(self._pool, self._threads, rows, 0, rays, sums)
         return estimator.blocked(self._pool, rows, sums, rays).astype(np.float64)
-
-
-def _levelled(blocked: NDArray, unshadowed: NDArray, sign: int) -> NDArray[np.float32]:
-    """Blocked part (n, K) less (sign -1) or plus (1) what it would be if as much of the sky were blocked evenly.
-
-    A neighbour that faces another way is so read as it would be here (as in `hybrid.filtered`).
-    """
-    out = np.array(blocked, np.float32)
-    out[:, 1:] += sign * blocked[:, :1] * unshadowed[:, 1:] / np.float32(FULL)
-    return out

@@ -168,16 +168,16 @@ def test_without_a_file_nothing_is_calibrated_nor_learned(clock):
     assert machine.runs == {"slow": 0} and factors(["slow"]) == [1]
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"version": 1}', '{"version": 1, "machines": 5}',
-                                     '{"version": 1, "machines": {"here": 5}}',
-                                     '{"version": 1, "machines": {"here": {"1": {"factors": {"slow": 0}}}}}',
-                                     '{"version": 1, "machines": {"here": {"1": {"calibrated": null}}}}',
-                                     '{"version": 1, "machines": {"here": {"1": {"off": Infinity}}}}',
-                                     '{"version": 1, "machines": {"here": {"1": {"off": "0"}}}}',
-                                     '{"version": 1, "machines": {"here": {"1": {"again": -1}}}}',
-                                     '{"version": 1, "machines": {"here": {"1": {"again": 4000000000}}}}',
-                                     '{"version": 1, "machines": {"here": {"one": {}}}}', "[" * 200_000,
-                                     '{"version": 1, "machines": {"here": {"1": {"factors": {"slow": "2"}}}}}'])
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"version": 2}', '{"version": 2, "machines": 5}',
+                                     '{"version": 2, "machines": {"here": 5}}',
+                                     '{"version": 2, "machines": {"here": {"1": {"factors": {"slow": 0}}}}}',
+                                     '{"version": 2, "machines": {"here": {"1": {"calibrated": null}}}}',
+                                     '{"version": 2, "machines": {"here": {"1": {"off": Infinity}}}}',
+                                     '{"version": 2, "machines": {"here": {"1": {"off": "0"}}}}',
+                                     '{"version": 2, "machines": {"here": {"1": {"again": -1}}}}',
+                                     '{"version": 2, "machines": {"here": {"1": {"again": 4000000000}}}}',
+                                     '{"version": 2, "machines": {"here": {"one": {}}}}', "[" * 200_000,
+                                     '{"version": 2, "machines": {"here": {"1": {"factors": {"slow": "2"}}}}}'])
 def test_a_damaged_file_is_replaced(file, clock, caplog, monkeypatch, content):
     monkeypatch.setattr(costs, "_machine", lambda: "here")
     file.parent.mkdir()
@@ -291,7 +291,7 @@ def test_time_between_the_steps_of_a_bake_does_not_count(clock):
 
 
 def test_rays_are_expected_to_be_shared_among_threads_where_they_are():
-    found = Pilot(0.3, 0.4, 0.03, rays=64, scale=1.0, ray=1e-7, traced=1, sample=(), threads=4)
+    found = Pilot(0.3, 0.4, 0.03, rays=64, scale=1.0, ray=1e-7, traced=1, sample=(), varies=0.3, turns=1.0, threads=4)
     assert not spread(4, 100 * 10) and found.seconds(100, 10) == pytest.approx(1e-4)
     assert spread(4, 100_000 * 10) and found.seconds(100_000, 10) == pytest.approx(0.025)
     many = replace(found, threads=64)  # of which few have any work
@@ -309,7 +309,7 @@ def test_a_pilot_says_what_a_ray_costs_on_one_thread(monkeypatch, threads, rays,
     monkeypatch.setattr(pilot, "clocked", lambda work: ((yield from work), 1.0))
     with workers(threads, rays) as pool:
         found = methods.run(pilot.look(mesh, scene, 3, 0.01, 0, pool, threads))
-    each = pilot.sample_size(len(mesh.points)) * 2 * (pilot.pilot_rays(0.01) + 4)
+    each = pilot.sample_size(len(mesh.points)) * 2 * (pilot.pilot_rays(0.01) + pilot._BESIDES)
     assert 2 < jobs[0] < 64
     assert found.ray * each == pytest.approx(jobs[0] if among == "jobs" else among)
     assert found.threads == found.to_order(2).threads == threads

@@ -25,7 +25,8 @@ def bake(mesh, **arguments):
 
 def seen(blocked, noise):
     """What a pilot may have seen, with 64 rays."""
-    return Pilot(blocked, 1.2 * blocked, noise, rays=64, scale=1.0, ray=1e-7, traced=1, sample=())
+    return Pilot(blocked, 1.2 * blocked, noise, rays=64, scale=1.0, ray=1e-7, traced=1, sample=(), varies=blocked,
+                 turns=1.0)
 
 
 def test_a_convex_mesh_traces_no_ray():

@@ -118,7 +118,8 @@ def test_before_training_it_is_a_mean_of_scene_points():
 def test_a_bake_is_the_same_in_any_order_in_chunks_and_on_any_threads(shipped, monkeypatch):
     mesh = torus()
     whole = bake(mesh, threads=1)
-    assert whole.record.method == "embedding" and whole.record.rays == 4096 * 64
+    count = sky_bake.count_of(mesh, Occluders([(mesh.positions, mesh.triangles)]))
+    assert whole.record.method == "embedding" and whole.record.rays == count * sky_bake.RAYS
     np.testing.assert_allclose(bake(mesh, threads=2).coefficients, whole.coefficients, atol=1e-5)
     monkeypatch.setattr(sky_bake, "QUERIES_AT_ONCE", 50)
     np.testing.assert_allclose(bake(mesh, threads=1).coefficients, whole.coefficients, atol=1e-5)
@@ -128,6 +129,26 @@ def test_a_bake_is_the_same_in_any_order_in_chunks_and_on_any_threads(shipped, m
     np.testing.assert_allclose(bake(other, threads=1).coefficients, whole.coefficients[rows], atol=1e-5)
     scene = methods.METHODS["embedding"].sees(mesh, ())
     np.testing.assert_allclose(bake(mesh, scene=scene).coefficients, whole.coefficients, atol=1e-5)
+
+
+def test_the_number_of_scene_points_is_by_surface_and_extent_alone():
+    def count(mesh):
+        return sky_bake.count_of(mesh, Occluders([(mesh.positions, mesh.triangles)]))
+
+    coarse = torus(12, 8)  # of which each face is cut into four
+    middles, triangles = coarse.positions[coarse.triangles], coarse.triangles
+    cut = np.concatenate([(middles + np.roll(middles, -1, 1)) / 2, middles], 1)  # (F, 6, 3)
+    fine = TriangleMesh.from_triangles(cut.reshape(-1, 3), (np.array([[0, 1, 2], [3, 0, 2], [4, 1, 0], [5, 2, 1]])
+                                                            + 6 * np.arange(len(triangles))[:, None, None]
+                                                            ).reshape(-1, 3).astype(np.int32))
+    area = 2 * np.pi ** 2 * 2 * 0.4 / 2.8 ** 2  # of a torus as long as a unit
+    assert count(torus(96, 64)) == pytest.approx(sky_bake.DENSITY * area, rel=0.01)
+    for other in (fine, moved(coarse, 1e3 * IDENTITY), moved(coarse, 1e-3 * IDENTITY, 5.0)):
+        assert count(other) == pytest.approx(count(coarse), abs=1)
+    assert count(moved(coarse, np.diag([1, 1, 1e-3]))) == sky_bake.POINTS
+    balls = np.concatenate([torus().positions + [0, 0, 0.01 * n] for n in range(9)])
+    faces = np.concatenate([torus().triangles + 384 * n for n in range(9)])
+    assert count(TriangleMesh.from_triangles(balls, faces)) == sky_bake.MOST
 
 
 @pytest.fixture

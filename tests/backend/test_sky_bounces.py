@@ -52,6 +52,7 @@ class Given:
 def anything(monkeypatch):
     """Any networks as those that ship, few patches and scene points: what is asked does not hang on their number."""
     monkeypatch.setattr(sky_bake, "POINTS", 512)
+    monkeypatch.setattr(sky_bake, "DENSITY", 0)
     monkeypatch.setattr(bounce, "Bounces", partial(Bounces, budget=1000))
     monkeypatch.setattr(sky_bake, "network", any_sky)
     monkeypatch.setattr(sky_bake, "reflecting", any_decoder)

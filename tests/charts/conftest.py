@@ -8,3 +8,4 @@ from neural_gash_addon.backend import sky_bake
 def few_scene_points(monkeypatch):
     """Meshes of some hundred vertices need no more, and trials bake hundreds of them."""
     monkeypatch.setattr(sky_bake, "POINTS", 256)
+    monkeypatch.setattr(sky_bake, "DENSITY", 150)

@@ -165,3 +165,18 @@ def test_parts_are_done_again_by_themselves_and_the_rooms_with_their_network(tmp
     assert {each["method"] for each in found["noise"]["rows"]} == set(methods.METHODS)
     assert found["trials"] == known["trials"]
     assert "`embedding` old" in stability.origin(found)
+
+
+def test_rooms_are_rows_of_the_table_too():
+    """Of the methods that compute what lamps add, beside the same room undisturbed."""
+    columns = len(trials_rooms.COLUMNS)
+    rows = [{"where": where, "light": 1.0, "errors": [network, *[0.3] * (columns - 2), paths],
+             "worst": [2 * network, *[0.0] * (columns - 2), 2 * paths]}
+            for where, network, paths in ((trials_rooms.CALM, 0.05, 0.1), ("in a gap", 0.2, 0.11))]
+    network, paths = sorted(stability.cells_of_rooms({"commit": "now", "rows": rows}), key=lambda cell: cell.method)
+    assert (network.method, paths.method) == ("embedding", "embree") and {network.commit, paths.commit} == {"now"}
+    assert network.ratio == pytest.approx(4) and network.red and not paths.red
+    table = stability.table([paths, network])
+    assert "| **light from within** |" in table and "| in a gap | 11 / 22 %, 1.1× | 🔴 20 / 40 %, 4× |" in table
+    assert stability.red_list([network, paths]).count("in a gap") == 2  # the trial and its case
+    assert stability.cells_of_rooms({}) == [] == stability.cells_of_rooms({"commit": "now", "rows": rows[1:]})
