@@ -154,7 +154,7 @@ class _Work:
     def __init__(self, mesh: TriangleMesh, scene: Occluders, order: int, seed: int, rays: int, curve: _Curve,
                  pool: Executor, threads: int, tolerance: float | None = None, sample_rays: int | None = None) -> None:
         """rays: the most."""
-        self._mesh, self._order, self._seed, self._curve = mesh, order, seed, curve
+        self._order, self._seed, self._curve, self._points = order, seed, curve, len(mesh.points)
         self._pool, self._threads, self._network = pool, threads, load_hybrid()
         self.lit, count = curve.lit, len(curve.lit)
         self._second = pool.submit(second_curve, curve.places)  # beside the rest, which waits for rays
@@ -207,8 +207,9 @@ class _Work:
 
     def along(self, points: NDArray, one: NDArray, two: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """What `sample` gives, of points of the mesh that were traced before."""
-        order = np.argsort(self.lit)
-        return order[np.searchsorted(self.lit, points, sorter=order)], one, two
+        place = np.zeros(self._points, np.int64)
+        place[self.lit] = np.arange(len(self.lit))
+        return place[points], one, two
 
     def blended(self, traced: NDArray, taken: NDArray, points: NDArray, one: NDArray, two: NDArray
                 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -17,6 +17,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
+from functools import cache
 
 from . import bands
 from .bands import Bands
@@ -153,10 +154,16 @@ def gnn_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[Pla
 
 def embedding_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[Plan]:
     """Rays from scene points alone, if there is PyTorch, as `gnn_ways`."""
-    if _EMBEDDING_LEFT * found.blocked > tolerance or importlib.util.find_spec("torch") is None:
+    if _EMBEDDING_LEFT * found.blocked > tolerance or not _torch_is_here():
         return []
     return [Plan("embedding", seconds=_EMBEDDING_SECONDS + found.seconds(points, _EMBEDDING_RAYS),
                  reason=f"Rays from some points, read by the embedding anywhere, are the quickest way to {said}.")]
+
+
+@cache
+def _torch_is_here() -> bool:
+    """Asked once: to look takes as long as a thousand rays."""
+    return importlib.util.find_spec("torch") is not None
 
 
 def _percent(part: float) -> str:

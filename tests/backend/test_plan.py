@@ -111,7 +111,7 @@ def test_every_method_of_the_table_that_says_what_it_could_do_is_a_candidate(mon
     assert metrics.rel_l2(found.coefficients, reference) <= 0.06
 
 
-def test_networks_are_candidates_where_their_usual_error_is_within_the_tolerance(monkeypatch):
+def test_networks_are_candidates_where_their_usual_error_is_within_the_tolerance(monkeypatch, request):
     ways = {name: methods.METHODS[name].ways for name in ("gnn", "embedding")}
     if ways and importlib.util.find_spec("torch"):
         assert [each.method for each in ways["embedding"](seen(0.2, 0.03), 10_000, 0.1, "10 %")] == ["embedding"]
@@ -119,6 +119,8 @@ def test_networks_are_candidates_where_their_usual_error_is_within_the_tolerance
     for way in ways.values():
         assert not way(seen(0.5, 0.03), 10_000, 0.1, "10 %")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    plan._torch_is_here.cache_clear()
+    request.addfinalizer(plan._torch_is_here.cache_clear)
     assert not ways["embedding"](seen(0.2, 0.03), 10_000, 0.1, "10 %")
     assert ways["gnn"](seen(0.2, 0.03), 10_000, 0.1, "10 %")
 
