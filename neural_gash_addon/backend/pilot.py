@@ -45,8 +45,8 @@ class Pilot:
     scale: float      # root mean square of |T|
     ray: float        # seconds of one, on one thread
     traced: int       # rays in all
-    sample: tuple[NDArray, NDArray, NDArray]  # points (n,) along a curve, and the blocked part (n, K) as each trace has it
-    varies: float     # what is blocked, from one to the next, root mean square of |T|; less than is seen is what is seen
+    sample: tuple[NDArray, NDArray, NDArray]  # points (n,) along a curve, and the blocked part (n, K) of each trace
+    varies: float     # what is blocked, from one of them to the next, root mean square of |T|
     turns: float      # their normals, likewise
     unshadowed: NDArray = field(default_factory=lambda: np.zeros((0, 0)))  # (n, K), of these points
     threads: int = 1  # that a bake has
