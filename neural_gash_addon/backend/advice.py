@@ -59,9 +59,12 @@ def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray, or
     faces = some[chosen]
     weights = np.stack([1 - u - v, u, v], 1)
     seen = _points(mesh, faces, weights)
-    one, two = yield from _traced(seen, scene, order, min(pilot_rays(tolerance), _MOST_RAYS), rng, threads)
+    rays, open_sky = min(pilot_rays(tolerance), _MOST_RAYS), sh.cosine_lobe(seen.normals, order)
+    with workers(threads, 2 * len(faces) * rays) as pool:
+        *blocked, _ = yield from twice(seen, scene, order, rays, seed, pool, threads)
+    one, two = (open_sky - trace for trace in blocked)
     energy = float((one * two).sum())
-    if energy <= _DARK ** 2 * float(np.square(sh.cosine_lobe(seen.normals, order)).sum()):
+    if energy <= _DARK ** 2 * float(np.square(open_sky).sum()):
         return None
     baked = np.einsum("nc,nck->nk", weights, coefficients[_of_corner(mesh, faces)].astype(np.float64))
     return float(max(float(((one - baked) * (two - baked)).sum()), 0.0) / energy) ** 0.5
@@ -91,15 +94,6 @@ def _areas(positions: NDArray, triangles: NDArray) -> NDArray[np.float64]:
     # axis by axis: NumPy is slow along short last ones
     (ax, bx), (ay, by), (az, bz) = ((axis[two] - axis[one], axis[three] - axis[one]) for axis in positions.T)
     return np.sqrt((ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2) / 2
-
-
-def _traced(points: TriangleMesh, scene: Occluders, order: int, rays: int, rng: np.random.Generator, threads: int
-            ) -> Generator[float, None, tuple[NDArray, NDArray]]:
-    """Transfer of points, twice, with rays of their own. Yields progress."""
-    with workers(threads, 2 * len(points.points) * rays) as pool:
-        *blocked, _ = yield from twice(points, scene, order, rays, int(rng.integers(2**31)), pool, threads)
-    unshadowed = sh.cosine_lobe(points.normals, order)
-    return unshadowed - blocked[0], unshadowed - blocked[1]
 
 
 def _points(mesh: TriangleMesh, faces: NDArray, weights: NDArray) -> TriangleMesh:

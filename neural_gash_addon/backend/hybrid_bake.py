@@ -83,7 +83,8 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     if tolerance is not None:
         stop = FIRST_RAYS if pilot is None else expected_rays(pilot, len(lit), tolerance)
     with workers(threads, len(lit) * (stop + _PASSES)) as pool:
-        work = _Work(mesh, scene, order, seed, last, curve, pool, threads, asked, pilot.rays if pilot else None)
+        work = _Work(mesh, scene, order, seed, last, curve, pool, threads, asked, pilot.rays if pilot else None,
+                     samples=pilot is None)
         # beside the rest, which waits for rays
         sample = pool.submit(work.sample) if pilot is None else pool.submit(work.along, *pilot.sample)
         while True:
@@ -152,8 +153,9 @@ class _Work:
     """The arrays of one bake, of the n points that have a normal, along the first curve."""
 
     def __init__(self, mesh: TriangleMesh, scene: Occluders, order: int, seed: int, rays: int, curve: _Curve,
-                 pool: Executor, threads: int, tolerance: float | None = None, sample_rays: int | None = None) -> None:
-        """rays: the most."""
+                 pool: Executor, threads: int, tolerance: float | None = None, sample_rays: int | None = None,
+                 samples: bool = False) -> None:
+        """rays: the most. sample_rays: of a pilot's points. samples: whether `sample` is wanted."""
         self._order, self._seed, self._curve, self._points = order, seed, curve, len(mesh.points)
         self._pool, self._threads, self._network = pool, threads, load_hybrid()
         self.lit, count = curve.lit, len(curve.lit)
@@ -172,8 +174,9 @@ class _Work:
         if tolerance is not None:
             self._sample_size, self._sample_rays = sample_size(count), sample_rays or pilot_rays(tolerance)
         self.probes = 2 * self._sample_size * self._sample_rays
-        self._estimator = BlockedEstimator(mesh, scene, order, seed, max(rays, self._sample_rays), spare=True)
-        self._estimator.prepare(self._sample_rays)  # once for both
+        self._estimator = BlockedEstimator(mesh, scene, order, seed, max(rays, self._sample_rays), spare=samples)
+        if samples:
+            self._estimator.prepare(self._sample_rays)  # once for both
 
     def trace(self, start: int, stop: int) -> Generator[float, None, tuple[NDArray[np.float32], NDArray[np.float32]]]:
         """The blocked part of all points from directions start..stop in addition to those before.

@@ -79,12 +79,15 @@ class Pilot:
     def error_of(self, coefficients: NDArray) -> float | None:
         """The relative L2 error of transfer (N, K) of all points, by these; None in the dark.
 
-        Both traces' noise is independent, so it cancels in the product.
+        Both traces' noise is independent, so it cancels in the product. An error that is too small to be told from what
+        is left of it (the standard error of its square) is said to be as large as that.
         """
         points, one, two = self.sample
         blocked = self.unshadowed - coefficients[points]
         energy = float(self._energies()[0].sum())
-        return float(max(((blocked - one) * (blocked - two)).sum(), 0.0) / energy) ** 0.5 if energy > 0 else None
+        squares = ((blocked - one) * (blocked - two)).sum(1)
+        least = float(np.square(squares).sum()) ** 0.5
+        return (max(float(squares.sum()), least) / energy) ** 0.5 if energy > 0 else None
 
     def seconds(self, points: int, rays: float) -> float:
         """Of so many rays, or what takes as long, from each of some points."""
@@ -114,8 +117,7 @@ def look(mesh: TriangleMesh, scene: Occluders, order: int, tolerance: float, see
     few = replace(mesh, points=mesh.points[points], normals=mesh.normals[points], clearance=mesh.clearance[points])
     rays = pilot_rays(tolerance)
     unshadowed = sh.cosine_lobe(few.normals, order)
-    (one, two, jobs), taken = yield from clocked(twice(few, scene, order, rays, int(rng.integers(2**31)), pool,
-                                                       threads))
+    (one, two, jobs), taken = yield from clocked(twice(few, scene, order, rays, seed, pool, threads))
     among = min(threads, jobs) if isinstance(pool, ThreadPoolExecutor) else 1
     ray = taken * among / (2 * (rays + _BESIDES) * max(wanted, 1))
     turns = float(np.square(np.diff(few.normals, axis=0)).sum(1).mean()) ** 0.5 if wanted > 1 else 0.0
@@ -125,10 +127,13 @@ def look(mesh: TriangleMesh, scene: Occluders, order: int, tolerance: float, see
 def twice(few: TriangleMesh, scene: Occluders, order: int, rays: int, seed: int, pool: Executor, threads: int
           ) -> Generator[float, None, tuple[NDArray[np.float64], NDArray[np.float64], int]]:
     """The blocked part (n, K) of the points of a mesh, twice, with independent rays; in how many jobs. Yields progress.
+
+    Independent of a bake with the same seed too, but not of each other: the same directions, and as many, are at hand.
     """
+    own = int(np.random.default_rng([seed, 5]).integers(2**31))
     rows = np.tile(np.arange(len(few.points)), 2)  # at once: what a trace costs at all is much, where points are few
     of = replace(few, points=few.points[rows], normals=few.normals[rows], clearance=few.clearance[rows])
-    twins, every = BlockedEstimator(of, scene, order, seed, rays, _SETS, twins=True), np.arange(len(rows))
+    twins, every = BlockedEstimator(of, scene, order, own, rays, _SETS, twins=True), np.arange(len(rows))
     sums = np.zeros((len(rows), sh.coefficient_count(order)))
     yield from twins.trace(pool, threads, every, 0, rays, sums)
     one, two = np.split(twins.turned_here(every, twins.means(every, sums, 0, rays)), 2)

@@ -26,7 +26,7 @@ def test_a_shadow_inside_a_face_that_its_corners_miss_is_said():
     assert target.startswith("Shadow edges inside faces are missed by their corners (")
     assert target.endswith("a texture would have them.")
     assert method.startswith("Shadows are")  # at the corners there is next to none, so nothing is traced
-    assert order == "Band 2 is 34 % of the whole: order 3 is kept."
+    assert re.fullmatch(r"Band 2 is 3[3-6] % of the whole: order 3 is kept\.", order)
     target = sentences(bake(fine, tolerance=0.1, occluders=[TABLE]).record)[3]
     assert target.startswith("Shadows inside faces follow their corners") and target.endswith("vertices are enough.")
 

@@ -22,7 +22,7 @@ def looked(mesh, scene, tolerance=0.02):
         return methods.run(pilot.look(mesh, scene, 3, tolerance, 0, pool, 1))
 
 
-@pytest.mark.parametrize("smooth, larger", ((True, 1.1), (False, 1.8)))
+@pytest.mark.parametrize("smooth, larger", ((True, 1.1), (False, 2.0)))
 @pytest.mark.parametrize("depth", (0.15, 0.25))
 def test_shadows_seem_as_large_as_they_are(depth, smooth, larger):
     """Or larger, with flat shading, whose normals are not those of the cells; then they are traced."""
@@ -30,11 +30,12 @@ def test_shadows_seem_as_large_as_they_are(depth, smooth, larger):
     few = merged.merged(mesh, ())
     assert few.mesh.points.shape == mesh.points.shape and len(few.triangles) < len(mesh.triangles)
     true = looked(mesh, Occluders([(mesh.positions, mesh.triangles)], mesh.resolution)).blocked
-    assert 0.95 * true < looked(few.mesh, few.scene).blocked < larger * true and true > 0.04
+    assert 0.85 * true < looked(few.mesh, few.scene).blocked < larger * true and true > 0.04
 
 
-def test_points_move_to_the_mean_of_their_cell():
+def test_points_move_to_the_mean_of_their_cell(monkeypatch):
     """Against a cell after the other."""
+    monkeypatch.setattr(merged, "_MOST", 1 << 20)  # or cells would be larger
     positions, triangles = bumpy(0.2, 4)
     mesh = TriangleMesh.from_triangles(positions, triangles)
     few = merged.merged(mesh, ())
@@ -51,8 +52,8 @@ def test_cells_are_larger_where_they_would_be_many(monkeypatch):
     mesh = TriangleMesh.from_triangles(*bumpy(0.2))
     few = merged.merged(mesh, ())
     monkeypatch.setattr(merged, "_MOST", 1 << 20)
-    assert len(merged.merged(mesh, ()).vertices) > 8000
-    assert 3500 < len(few.vertices) < 4700  # as asked for, on a surface
+    assert len(merged.merged(mesh, ()).vertices) > 5000
+    assert 2500 < len(few.vertices) < 3600  # as asked for, on a surface
     assert len(np.unique(few.mesh.points, axis=0)) == len(few.vertices)
 
 
