@@ -27,13 +27,13 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def summary(rows: list[chart_draw.Row]) -> str:
     """Medians over the meshes of the base sweep, and the peers' of theirs: a table in Markdown."""
-    titles = ("method", "rays", "meshes", "µs a point", "× Embree 64", "SRR", "rel L2", "relit, mean", "relit, worst",
-              "claims", "MB")
+    titles = ("method", "rays or tolerance", "meshes", "µs a point", "× Embree 64", "SRR", "rel L2", "relit, mean",
+              "relit, worst", "claims", "MB")
     lines = ["| " + " | ".join(titles) + " |", "|---" * len(titles) + "|"]
     chosen = [row for row in rows if np.isfinite(row["seconds"]) and (
         row["sweep"] == "base" or (row["sweep"] == "peers" and row["method"] not in METHODS))]
-    for method, rays in dict.fromkeys((row["method"], row["rays"]) for row in chosen):
-        own = [row for row in chosen if (row["method"], row["rays"]) == (method, rays)]
+    for method, rays, tolerance in dict.fromkeys(_setting(row) for row in chosen):
+        own = [row for row in chosen if _setting(row) == (method, rays, tolerance)]
         claims = [row["claimed"] for row in own if row["claimed"] is not None]
         cells = [f"{np.median([1e6 * row['seconds'] / row['points'] for row in own]):.3g}"]
         cells += [f"{np.median([row[name] for row in own]):.3g}" if np.isfinite(own[0][name]) else ""
@@ -41,19 +41,26 @@ def summary(rows: list[chart_draw.Row]) -> str:
         cells.append(f"{np.median(claims):.3g}" if claims else "")
         held = [row["memory_mb"] for row in own if isinstance(row["memory_mb"], float | int)]
         cells.append(f"{np.median(held):.0f}" if held else "")
-        lines.append(f"| {method} | {rays or ''} | {len(own)} | " + " | ".join(cells) + " |")
+        told = f"{tolerance:.0%}" if tolerance else rays or ""
+        lines.append(f"| {method} | {told} | {len(own)} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
+def _setting(row: chart_draw.Row) -> chart_draw.Key:
+    return row["method"], row["rays"], row["tolerance"]
+
+
 def memory(rows: list[chart_draw.Row]) -> str:
-    """Seconds and peak memory by size, with as many rays as memory was measured with: a table in Markdown."""
+    """Seconds and peak memory by size, with the rays or the tolerance that memory was measured with: a table in
+    Markdown.
+    """
     sizes = sorted({row["points"] for row in rows if row["sweep"] == "scale"})
     lines = ["| method | " + " | ".join(f"{size:,} vertices" for size in sizes) + " |", "|---" * (1 + len(sizes)) + "|"]
     for method in METHODS:
         cells = []
         for size in sizes:
             own = [row for row in rows if row["sweep"] == "scale" and row["method"] == method and row["points"] == size
-                   and row["rays"] in (None, 64)]
+                   and row["rays"] in (None, 64) and row["tolerance"] in (None, chart_measure.MEMORY_TOLERANCE)]
             if not own:
                 cells.append("")
             elif isinstance(own[0]["memory_mb"], float | int):

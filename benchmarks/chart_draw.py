@@ -19,7 +19,7 @@ from neural_gash_addon.backend.compare import REFERENCE_RAYS, front
 from neural_gash_addon.backend.methods import METHODS
 
 Row = dict[str, Any]
-Key = tuple[str, int | None]
+Key = tuple[str, int | None, float | None]  # method, rays, tolerance
 LABELS = {"srr": "SRR (1: no better than no shadows)", "rel_l2": "relative L2 error of transfer",
           "relit_mean": "relit error, mean of the HDRIs", "relit_worst": "relit error, worst HDRI",
           "openness": "relative L2 error of openness (ambient occlusion)"}
@@ -38,11 +38,11 @@ def _style(method: str) -> dict[str, Any]:
 
 
 def collected(rows: Sequence[Row], error: str) -> dict[Key, tuple[list[float], list[float]]]:
-    """(µs a point, errors) of each method and number of rays, over meshes."""
+    """(µs a point, errors) of each method and number of rays, or tolerance, over meshes."""
     found: dict[Key, tuple[list[float], list[float]]] = {}
     for row in rows:
         if row["method"] in (*METHODS, *PEER_LABELS) and np.isfinite(row["seconds"]) and np.isfinite(row[error]):
-            times, errors = found.setdefault((row["method"], row["rays"]), ([], []))
+            times, errors = found.setdefault((row["method"], row["rays"], row["tolerance"]), ([], []))
             times.append(1e6 * row["seconds"] / row["points"])
             errors.append(row[error])
     return found
@@ -53,8 +53,8 @@ def _panel(axes: Axes, rows: Sequence[Row], error: str, spread: bool = True,
     """One chart: medians over meshes, bars from the 10th to the 90th percentile, front and noise floor."""
     found = collected(rows, error)
     medians = {key: (float(np.median(times)), float(np.median(errors))) for key, (times, errors) in found.items()}
-    for method in dict.fromkeys(method for method, _ in found):
-        keys = sorted((key for key in found if key[0] == method), key=lambda key: key[1] or 0)
+    for method in dict.fromkeys(method for method, *_ in found):
+        keys = sorted((key for key in found if key[0] == method), key=lambda key: (key[1] or 0, -(key[2] or 0)))
         x, y = np.array([medians[key] for key in keys]).T
         style = _style(method)
         if spread and len(found[keys[0]][0]) > 1:
@@ -64,8 +64,9 @@ def _panel(axes: Axes, rows: Sequence[Row], error: str, spread: bool = True,
                 axes.plot((a, a), np.maximum(errors, 1e-9), color=style["color"], alpha=0.3, linewidth=1)
         axes.plot(x, y, **style, markersize=5, linewidth=1)
         for key, a, b in zip(keys, x, y, strict=True):
-            if key[1] is not None and key[1] in (keys[0][1], keys[-1][1], 64) and named(method):
-                axes.annotate(str(key[1]), (a, b), textcoords="offset points", xytext=(4, 4), fontsize=7,
+            told = key[1] or (key[2] and f"{key[2]:.0%}")
+            if told and (key in (keys[0], keys[-1]) or key[1] == 64) and named(method):
+                axes.annotate(str(told), (a, b), textcoords="offset points", xytext=(4, 4), fontsize=7,
                               color=style["color"])
     keys = list(medians)
     best = front([medians[key][0] for key in keys], [medians[key][1] for key in keys])

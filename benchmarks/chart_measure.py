@@ -37,6 +37,7 @@ ORDER = 3
 RAYS = (2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
 FEW = (2, 8, 32, 64, 128, 512)   # of the sweeps that only show what one thing changes
 PEER_RAYS = (4, 16, 64, 256)
+MEMORY_TOLERANCE = 0.05          # of a method that plans, where others have BASELINE_RAYS
 SAMPLE = 4096                    # points of a mesh, or all, at which errors are measured
 REFERENCE_SEED, SEED, ROUNDS = 77, 0, 3
 SIDE = 256                       # texels of a texture
@@ -44,7 +45,7 @@ SWEEPS = "base", "peers", "threads", "orders", "texture"
 PEERS = {"trimesh": Trimesh, "open3d": Open3D}
 CYCLES = "cycles-ao"
 COLUMNS = ("points", "method", "order", "rays", "threads", "target", "seconds", "least", "most", "ratio", "runs", "srr",
-           "rel_l2", "openness", "relit_mean", "relit_worst", "claimed", "memory_mb", "note")
+           "rel_l2", "openness", "relit_mean", "relit_worst", "claimed", "memory_mb", "note", "tolerance")
 
 
 @dataclass(frozen=True)
@@ -98,12 +99,13 @@ def _settings(case: Case, points: int) -> list[Setting]:
         rays = (2, 8, 32, 64, 128)
     if case.sweep == "scale":  # a million points take as long as there is time for
         rays = tuple(count for count in RAYS if count * points <= 1.3e8)
+    tolerances = compare.TOLERANCES if case.sweep in ("base", "scale") else compare.TOLERANCES[1:4]
     if case.quick:
-        rays = tuple(count for count in rays if count in (2, 16, 64))
+        rays, tolerances = tuple(count for count in rays if count in (2, 16, 64)), tolerances[1:3]
     found = []
+    threads = 1 if case.sweep == "threads" else threads
     for order in ((2, 4, 5) if case.sweep == "orders" else (ORDER,)):
-        found += [*compare.settings_of(order, rays, 1 if case.sweep == "threads" else threads),
-                  compare.baseline(order, 1 if case.sweep == "threads" else threads)]
+        found += [*compare.settings_of(order, rays, threads, tolerances), compare.baseline(order, threads)]
     if case.sweep == "peers":
         samples = PEER_RAYS[:2] if case.quick else PEER_RAYS
         found += [Setting(peer, ORDER, count, threads=threads) for peer in (*PEERS, CYCLES) for count in samples]
@@ -181,8 +183,9 @@ def measure(case: Case, lights: list[NDArray], only: frozenset[str] = frozenset(
 
         def bake(setting: Setting, seed: int) -> Generator[float, None, tuple[NDArray, BakeRecord | None]]:
             found = yield from texture.bake(surface, setting.method, setting.order, uv=uv, side=side,
-                                            rays=setting.rays, seed=seed, threads=setting.threads)
-            return np.concatenate(found.coefficients), found.record
+                                            rays=setting.rays, tolerance=setting.tolerance, seed=seed,
+                                            threads=setting.threads)
+            return sh.padded(np.concatenate(found.coefficients), sh.coefficient_count(setting.order)), found.record
     settings = _settings(case, len(points.points))
     whole_table = only == frozenset(methods.METHODS)
     if not whole_table:
@@ -192,8 +195,9 @@ def measure(case: Case, lights: list[NDArray], only: frozenset[str] = frozenset(
     if case.sweep == "scale" or (case.sweep == "base" and not case.quick):
         # first, so that what the machine has no room for is not tried here
         for name in dict.fromkeys(setting.method for setting in settings if setting.method in only):
-            rays = compare.BASELINE_RAYS if methods.METHODS[name].traces else None
-            memory[name] = peak(name, case.mesh, ORDER, rays)
+            entry = methods.METHODS[name]
+            rays = compare.BASELINE_RAYS if entry.traces and not entry.plans else None
+            memory[name] = peak(name, case.mesh, ORDER, rays, MEMORY_TOLERANCE if entry.plans else None)
             yield 0.0
         settings = [setting for setting in settings if not isinstance(memory.get(setting.method), str)]
     sees = methods.METHODS["embree"].sees
@@ -234,7 +238,8 @@ def _row(case: Case, points: int, found: Measurement, note: str) -> dict[str, An
     figures = {name: getattr(found, name) for name in
                ("ratio", "srr", "rel_l2", "openness", "relit_mean", "relit_worst", "claimed")}
     return {"points": points, "method": setting.method, "order": setting.order, "rays": setting.rays,
-            "threads": setting.threads, "target": "texture" if case.sweep == "texture" else "vertices",
+            "tolerance": setting.tolerance, "threads": setting.threads,
+            "target": "texture" if case.sweep == "texture" else "vertices",
             "seconds": found.median, "least": min(found.seconds, default=None),
             "most": max(found.seconds, default=None), "runs": len(found.seconds), "note": found.refused or note,
             **figures}
@@ -260,8 +265,14 @@ def about() -> dict[str, Any]:
 
 
 def load(path: Path) -> list[dict[str, Any]]:
-    """The blocks that are there."""
-    return json.loads(path.read_text())["blocks"] if path.is_file() else []
+    """The blocks that are there; what a column that is new in COLUMNS had is not known."""
+    if not path.is_file():
+        return []
+    found = json.loads(path.read_text())
+    for block in found["blocks"]:
+        rows = [dict(zip(found["columns"], row, strict=True)) for row in block["rows"]]
+        block["rows"] = [[row.get(column) for column in COLUMNS] for row in rows]
+    return found["blocks"]
 
 
 def save(path: Path, blocks: Iterable[dict[str, Any]]) -> None:

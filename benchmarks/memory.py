@@ -21,7 +21,7 @@ def _megabytes(field: str) -> float:
         return next(int(line.split()[1]) for line in file if line.startswith(field)) * 1024 / 1e6
 
 
-def _child(method: str, mesh_name: str, order: int, rays: int | None) -> None:
+def _child(method: str, mesh_name: str, order: int, rays: int | None, tolerance: float | None) -> None:
     """Build a mesh, bake it, report."""
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
     import trimesh  # noqa: F401  which reads files, and is no part of a bake
@@ -34,12 +34,13 @@ def _child(method: str, mesh_name: str, order: int, rays: int | None) -> None:
     mesh = named(mesh_name)
     built, held = _megabytes("VmHWM"), _megabytes("VmRSS")
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak counts anew from here
-    transfer = methods.run(methods.bake(mesh, method, order, rays=rays))
+    transfer = methods.run(methods.bake(mesh, method, order, rays=rays, tolerance=tolerance))
     print(json.dumps({"vertices": len(mesh.points), "seconds": transfer.record.seconds, "built": built - start,
                       "held": held - start, "baked": _megabytes("VmHWM") - start}))
 
 
-def peak(method: str, mesh: str, order: int, rays: int | None) -> dict[str, float] | str:
+def peak(method: str, mesh: str, order: int, rays: int | None, tolerance: float | None = None
+         ) -> dict[str, float] | str:
     """Vertices, seconds, and MB over the process's start: built, held, baked. Or why there are none.
 
     mesh: a name for `meshes.named`.
@@ -47,7 +48,7 @@ def peak(method: str, mesh: str, order: int, rays: int | None) -> dict[str, floa
     if not Path("/proc/self/status").exists():
         return "needs Linux's /proc"
     try:
-        done = subprocess.run([sys.executable, __file__, method, mesh, str(order), str(rays or 0)],
+        done = subprocess.run([sys.executable, __file__, method, mesh, str(order), str(rays or 0), str(tolerance or 0)],
                               capture_output=True, text=True, check=False, timeout=LONGEST)
     except subprocess.TimeoutExpired:
         return f"more than {LONGEST} s"
@@ -74,4 +75,4 @@ def measure(table: Table, quick: bool) -> None:
 
 
 if __name__ == "__main__":
-    _child(sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4]) or None)
+    _child(sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4]) or None, float(sys.argv[5]) or None)

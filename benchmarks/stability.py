@@ -36,6 +36,7 @@ from neural_gash_addon.backend.geometry import TriangleMesh
 from neural_gash_addon.backend.record import BakeRecord
 
 RAYS = 64
+TOLERANCE = 0.05  # of methods that plan
 # What `sparse` is told instead, as it would itself trace every point of hosts as coarse as these for the 3 to 6 % that
 # RAYS give: a relative error, and how many points there are for each of its first samples.
 SPARSE_TOLERANCE, SPARSE_STRIDE = 0.2, 8
@@ -73,7 +74,7 @@ class Cell:
 def settings() -> list[Setting]:
     """Every method of the table."""
     return [replace(setting, rays=None, tolerance=SPARSE_TOLERANCE) if setting.method == "sparse" else setting
-            for setting in compare.settings_of(ORDER, (RAYS,))]
+            for setting in compare.settings_of(ORDER, (RAYS,), tolerances=(TOLERANCE,))]
 
 
 def _errors(variant: Variant, setting: Setting) -> np.ndarray:

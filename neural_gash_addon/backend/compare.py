@@ -25,6 +25,7 @@ from .record import BakeRecord
 
 REFERENCE_RAYS = 4096  # of each of the two traces that a reference is the mean of
 BASELINE_RAYS = 64     # of the plain Embree bake that times are quoted beside
+TOLERANCES = (0.2, 0.1, 0.05, 0.02, 0.01)  # of methods that plan
 ENOUGH = 1.0           # seconds of a setting, after which it is not repeated
 _ROUND_UP = 32         # rays that cost about as much as what a bake does besides: for the progress only
 _TETRAHEDRON = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array(
@@ -88,10 +89,21 @@ class Measurement:
         return statistics.median(self.seconds) if self.seconds else float("nan")
 
 
-def settings_of(order: int, rays: Sequence[int], threads: int | None = None) -> list[Setting]:
-    """Every method in the table: those that trace with each number of rays, the others once."""
-    return [Setting(method.name, order, count, threads=threads)
-            for method in methods.METHODS.values() for count in (rays if method.traces else (None,))]
+def settings_of(order: int, rays: Sequence[int], threads: int | None = None,
+                tolerances: Sequence[float] = TOLERANCES) -> list[Setting]:
+    """Every method in the table: those that plan with each tolerance, which is what they plan by; those that trace with
+    each number of rays, the others once.
+    """
+    found: list[Setting] = []
+    for method in methods.METHODS.values():
+        plain = Setting(method.name, order, threads=threads)
+        if method.plans:
+            found += [replace(plain, tolerance=tolerance) for tolerance in tolerances]
+        elif method.traces:
+            found += [replace(plain, rays=count) for count in rays]
+        else:
+            found.append(plain)
+    return found
 
 
 def baseline(order: int, threads: int | None = None) -> Setting:

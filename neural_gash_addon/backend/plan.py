@@ -28,7 +28,7 @@ from .transfer import Transfer
 
 _SAFE = 1.06                 # what the pilot's noise may be too low by
 _FEW_RAYS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # of plain bakes; with more, not to take all alike saves more
-_EMBREE_SECONDS, _HYBRID_SECONDS = 5e-4, 1e-3  # what a bake costs at all,
+_EMBREE_SECONDS, _HYBRID_SECONDS = 5e-4, 7e-4  # what a bake costs at all,
 _PLAIN_RAYS, _EMBREE_RAYS, _HYBRID_RAYS = 3.0, 11.0, 8.0  # and at each point besides its rays, in rays
 _EMBREE_MORE = 1.07  # the rays of one to a tolerance beside those that are needed if all take as many
 SPARSE_POINTS = 1 << 16      # from which on a sparse bake is a candidate; below, too many are samples

@@ -28,6 +28,7 @@ from .bake import Baking, bake_refusal
 from .job import occluder_mode, percent
 
 _RAYS = (2, 8, 32, 128)
+_TOLERANCES = (0.1, 0.05, 0.02)  # of the planner
 _POINTS = 8192        # of the mesh, or all, at which errors are measured
 _ROUNDS = 2
 _SEED, _REFERENCE_SEED = 0, 77
@@ -64,7 +65,8 @@ def _compared(mesh: TriangleMesh, occluders: Sequence[Geometry], chosen: Setting
     """The arrays of it all; never touches bpy."""
     rows = compare.sample(len(mesh.points), _POINTS, _REFERENCE_SEED)
     truth = yield from scaled(compare.reference(mesh, chosen.order, rows, occluders, _REFERENCE_SEED), 0, _SHARE)
-    settings = [*compare.settings_of(chosen.order, _RAYS), compare.baseline(chosen.order), chosen]
+    settings = [*compare.settings_of(chosen.order, _RAYS, tolerances=_TOLERANCES), compare.baseline(chosen.order),
+                chosen]
     work = compare.compare(compare.vertex_bake(mesh, occluders), settings, truth, lights, _ROUNDS, _SEED)
     return truth, (yield from scaled(work, _SHARE, 1 - _SHARE))
 

@@ -34,10 +34,11 @@ def sky():
 
 def test_every_method_of_the_table_appears(monkeypatch):
     monkeypatch.setitem(methods.METHODS, "later", replace(methods.METHODS["embree"], name="later"))
-    found = compare.settings_of(ORDER, (2, 4))
+    found = compare.settings_of(ORDER, (2, 4), tolerances=(0.1,))
     assert {s.method for s in found} == set(methods.METHODS)
     assert [s.rays for s in found if s.method == "later"] == [2, 4]
     assert [s.rays for s in found if s.method == "gnn"] == [None]
+    assert [(s.rays, s.tolerance) for s in found if s.method == "auto"] == [(None, 0.1)]  # what it plans by
 
 
 def test_measured_is_what_the_bakes_give(torus, truth):
