@@ -164,11 +164,14 @@ class BlockedEstimator:
         count = harmonics.shape[-2]
         if mixed := harmonics.ndim == 3:
             here = self._set_of_point[points]
-            rows = frames.transpose(1, 2, 0)  # (3, 3, n)
+            local = np.ascontiguousarray(directions.transpose(2, 1, 0)).take(here, 2)  # (3, r, n): points are last
             world = np.empty((len(points), count, 3), np.float32)
-            for number, (x, y, z) in enumerate(directions.transpose(1, 2, 0)[:, :, here]):
-                for axis, (tangent, bitangent, normal) in enumerate(rows):
-                    world[:, number, axis] = x * tangent + y * bitangent + z * normal
+            part = np.empty(local.shape[1:], np.float32)
+            for axis, row in enumerate(frames.transpose(1, 2, 0)):
+                along = local[0] * row[0]
+                for component, way in zip(local[1:], row[1:], strict=True):
+                    along += np.multiply(component, way, out=part)
+                world[:, :, axis] = along.T
             world = world.reshape(-1, 3)
         else:
             world = product(np.ascontiguousarray(frames).reshape(-1, 9), directions).reshape(-1, 3)

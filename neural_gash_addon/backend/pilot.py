@@ -25,7 +25,7 @@ from .workers import spread
 POINTS = 256                  # or a 16th of them all, if that is less; or a 256th, if that is more
 _FEWEST, _MOST = 128, 2048
 _NOISE, _NOISE_RAYS = 0.035, 64  # the noise of so many rays is no more on most meshes
-_LEAST_RAYS, _MOST_RAYS = 16, 256
+_LEAST_RAYS, _MOST_RAYS = 8, 256
 _SETS = 8
 _UNEVEN = 1.1                 # of the noise of rays that are no power of two, and so no whole net, to that of such
 _BESIDES = 16.0               # what a point of these costs besides its rays, in rays

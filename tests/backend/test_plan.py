@@ -138,8 +138,8 @@ def test_a_network_that_were_the_cheapest_is_asked_and_measured(name, monkeypatc
     np.testing.assert_array_equal(found.coefficients, direct.coefficients)
     reference = bake(mesh, method="embree", rays=2048, seed=9).coefficients
     true = metrics.rel_l2(found.coefficients, reference)
-    # a look at 20 % cannot tell less than 2 or 3 % from its own noise, and says so much then
-    assert 0.5 * true < found.record.error_estimate < max(1.5 * true, 0.03)
+    # a look at 20 % cannot tell less than 3 or 4 % from its own noise, and says so much then
+    assert 0.5 * true < found.record.error_estimate < max(1.5 * true, 0.05)
 
 
 def test_shadows_below_the_tolerance_are_not_traced():
