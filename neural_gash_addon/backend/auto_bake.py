@@ -26,6 +26,7 @@ from .workers import default_threads, workers
 
 _PILOT_SHARE = 0.05  # of the progress
 _ROUGH = 0.05    # a tolerance that a look at a merged mesh, with the rays of twice that, is exact enough for
+_BY_THE_LAW = 1.1  # of the tolerance: what the error with a number of rays may seem to be, as the pilot errs too
 _MANY = 1 << 18  # points that are baked at a time, where those that are looked at are but some of them
 
 
@@ -46,7 +47,8 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     """Bake as cheaply as the tolerance allows; arguments as `methods.bake`.
 
     candidates: by name. With a number of rays there is nothing to plan but whether any is needed. What a method without
-    rays gives is compared with the pilot, and traced where it is not within the tolerance.
+    rays gives, or a number of them, is compared with the pilot, and baked by one that measures where that is not within
+    the tolerance.
     """
     began, count = time.perf_counter(), threads or default_threads()
     planning = planned(mesh, order, rays, tolerance, occluders, seed, threads, scene, whole, candidates)
@@ -66,13 +68,16 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     error = transfer.record.error_estimate
     if plan.method == "analytic":
         error = pilot.blocked if pilot is not None else 0.0
-    elif pilot is not None and tolerance is not None and not candidates[plan.method].traces:
-        error = pilot.error_of(transfer.coefficients)
+    elif pilot is not None and tolerance is not None and plan.tolerance is None:
         left = tolerance if whole else found.bands.left
-        if error is None or error > left:
+        if candidates[plan.method].traces:
+            missed = error is not None and error > _BY_THE_LAW * left
+        else:
+            error = pilot.error_of(transfer.coefficients)
+            missed = error is None or error > left
+        if missed:
             ways = yield from scaled(costs.ways(candidates, count, len(mesh.points)), _PILOT_SHARE, 0)
-            plan = cheapest(pilot, len(mesh.points), left, [way for name, way in ways.items()
-                                                            if candidates[name].traces], tolerance)
+            plan = cheapest(pilot, len(mesh.points), left, ways.values(), tolerance, measuring=True)
             transfer = yield from scaled(work(plan), _PILOT_SHARE, 1 - _PILOT_SHARE)
             error = transfer.record.error_estimate
     record = replace(transfer.record, plan=plan.reason).also(found.bands.reason).also(advice.domain(mesh))

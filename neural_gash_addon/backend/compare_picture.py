@@ -81,7 +81,7 @@ def picture(found: Sequence[Measurement], points: int, floor: float, title: str,
         number = names.index(method)
         own = sorted((m.setting.rays or 0, -(m.setting.tolerance or 0), t, e)
                      for m, t, e in zip(measured, times, errors, strict=True)
-                     if m.setting.method == method and (m.setting.tolerance is None or METHODS[method].plans))
+                     if m.setting.method == method and (m.setting.tolerance is None) != METHODS[method].plans)
         for (*_, t0, e0), (*_, t1, e1) in zip(own, own[1:], strict=False):
             canvas.line((axis.x(t0), axis.y(e0)), (axis.x(t1), axis.y(e1)), _COLOURS[number % len(_COLOURS)], 2)
     for index, m in enumerate(measured):

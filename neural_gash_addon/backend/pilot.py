@@ -128,7 +128,7 @@ def twice(few: TriangleMesh, scene: Occluders, order: int, rays: int, seed: int,
           ) -> Generator[float, None, tuple[NDArray[np.float64], NDArray[np.float64], int]]:
     """The blocked part (n, K) of the points of a mesh, twice, with independent rays; in how many jobs. Yields progress.
 
-    Independent of a bake with the same seed too, but not of each other: the same directions, and as many, are at hand.
+    Independent of a bake with the same seed too, but not of each other: where they are as many, directions are at hand.
     """
     own = int(np.random.default_rng([seed, 5]).integers(2**31))
     rows = np.tile(np.arange(len(few.points)), 2)  # at once: what a trace costs at all is much, where points are few

@@ -102,10 +102,14 @@ def unshadowed(found: Pilot, tolerance: float, safe: float = 1.0) -> Plan | None
     return _unshadowed(found) if safe * found.most_blocked <= tolerance else None
 
 
-def cheapest(found: Pilot, points: int, tolerance: float, ways: Ways, asked: float | None = None) -> Plan:
-    """The cheapest of all ways; the tolerance is what is left of another, if one was asked for."""
-    return min((plan for way in ways for plan in way(found, points, tolerance, _percent(asked or tolerance))),
-               key=lambda plan: plan.seconds)
+def cheapest(found: Pilot, points: int, tolerance: float, ways: Ways, asked: float | None = None,
+             measuring: bool = False) -> Plan:
+    """The cheapest of all ways; the tolerance is what is left of another, if one was asked for.
+
+    measuring: of those that go on until they have measured that it is met, as other plans missed it.
+    """
+    return min((plan for way in ways for plan in way(found, points, tolerance, _percent(asked or tolerance))
+                if plan.tolerance or not measuring), key=lambda plan: plan.seconds)
 
 
 def _unshadowed(found: Pilot) -> Plan:

@@ -11,15 +11,16 @@ import numpy as np
 from bpy.props import StringProperty
 from numpy.typing import NDArray
 
-from ..backend import compare
+from ..backend import compare, costs
 from ..backend.compare import Measurement, Reference, Setting
 from ..backend.compare_picture import heat, picture, spread
 from ..backend.errors import UserError
 from ..backend.geometry import TriangleMesh
-from ..backend.methods import METHODS
+from ..backend.methods import METHODS, candidates
 from ..backend.neighbours import neighbours
 from ..backend.progress import scaled
 from ..backend.raycast import Geometry
+from ..backend.workers import default_threads
 from ..properties import RAYS, NeuralGashSettings
 from ..scene.comparison import check_chart, check_errors, save_chart, show, write_chart, write_errors
 from ..scene.environments import shipped_environments
@@ -57,7 +58,7 @@ def _chosen(settings: NeuralGashSettings) -> Setting:
         return Setting(settings.method, settings.order)
     by_rays = settings.quality == RAYS
     return Setting(settings.method, settings.order, settings.rays if by_rays else None,
-                   None if by_rays else settings.tolerance)
+                   None if by_rays else round(settings.tolerance, 6))  # which Blender keeps in 32 bits
 
 
 def _compared(mesh: TriangleMesh, occluders: Sequence[Geometry], chosen: Setting, lights: Sequence[NDArray]
@@ -67,6 +68,8 @@ def _compared(mesh: TriangleMesh, occluders: Sequence[Geometry], chosen: Setting
     truth = yield from scaled(compare.reference(mesh, chosen.order, rows, occluders, _REFERENCE_SEED), 0, _SHARE)
     settings = [*compare.settings_of(chosen.order, _RAYS, tolerances=_TOLERANCES), compare.baseline(chosen.order),
                 chosen]
+    # where the machine is not calibrated yet, not while the planner is timed
+    yield from scaled(costs.ways(candidates(), default_threads(), len(mesh.points)), _SHARE, 0)
     work = compare.compare(compare.vertex_bake(mesh, occluders), settings, truth, lights, _ROUNDS, _SEED)
     return truth, (yield from scaled(work, _SHARE, 1 - _SHARE))
 

@@ -49,6 +49,19 @@ def test_the_rays_expected_bring_about_the_tolerance(shape, tolerance):
     assert 0.5 < metrics.rel_l2(answer, truth) / tolerance < 1.5
 
 
+def test_an_error_too_small_to_tell_is_said_to_be_as_large_as_can_be_told():
+    """Traces are the truth and noise: of the truth itself nothing, or less than nothing, is left but their noise."""
+    rng, points = np.random.default_rng(2), np.arange(128)
+    truth = rng.normal(size=(128, 9))
+    for _ in range(60):
+        one, two = (truth + 0.1 * rng.normal(size=truth.shape) for _ in range(2))
+        found = Pilot(0.3, 0.4, 0.1, 16, 1.0, 1e-7, 1, (points, one, two), 0.1, 1.0, 2 * truth)
+        noise = (0.1 ** 4 * 128 * 9) ** 0.25 / 128 ** 0.5 / 3  # of the root of the sum of products, relative
+        assert 0.5 * noise < found.error_of(truth) < 3 * noise
+        large = truth + 0.5 * rng.normal(size=truth.shape)
+        assert found.error_of(large) == pytest.approx(metrics.rel_l2(large, truth), rel=0.2)
+
+
 def test_fewer_rays_are_expected_where_neighbours_tell_more_and_never_more_than_plain_ones():
     rays = hybrid_bake.expected_rays
     few = rays(seen(), 10_000, 0.02)
