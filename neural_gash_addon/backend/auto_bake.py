@@ -9,14 +9,10 @@ import time
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from . import advice, costs
-from . import spherical_harmonics as sh
 from .bands import Bands, all_of, of_open_sky
 from .geometry import TriangleMesh
 from .horizon import nothing_blocks
-from .merged import SAFE, Merged, dense, merged
 from .pilot import Pilot, look, looking
 from .plan import Candidate, Plan, cheapest, traced_bands, unshadowed, unshadowed_bands
 from .progress import clocked, scaled
@@ -25,7 +21,6 @@ from .transfer import Transfer
 from .workers import default_threads, workers
 
 _PILOT_SHARE = 0.05  # of the progress
-_ROUGH = 0.05    # a tolerance that a look at a merged mesh, with the rays of twice that, is exact enough for
 _BY_THE_LAW = 1.1  # of the tolerance: what the error with a number of rays may seem to be, as the pilot errs too
 _MANY = 1 << 18  # points that are baked at a time, where those that are looked at are but some of them
 
@@ -38,7 +33,6 @@ class Planned:
     scene: Occluders | None
     pilot: Pilot | None  # of the order that is baked; None: nothing was traced
     bands: Bands
-    merged: Merged | None = None  # what was looked at instead of the scene
 
 
 def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float | None, occluders: Sequence[Geometry],
@@ -83,12 +77,9 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     record = replace(transfer.record, plan=plan.reason).also(found.bands.reason).also(advice.domain(mesh))
     probes = record.probe_rays
     if pilot is not None and tolerance is not None:
-        seen, scene, corners = mesh, found.scene, transfer.coefficients
-        if found.merged:
-            seen, scene = found.merged.surface(), found.merged.scene
-            corners = sh.cosine_lobe(seen.normals, order).astype(np.float32)
-        assert scene is not None
-        asking = advice.inside_faces(seen, scene, corners, order, tolerance, seed, threads or default_threads())
+        assert found.scene is not None
+        asking = advice.inside_faces(mesh, found.scene, transfer.coefficients, order, tolerance, seed,
+                                     threads or default_threads())
         inside = yield from scaled(asking, 1, 0)
         if inside is not None:
             record = replace(record, between_error=inside).also(advice.said(inside, tolerance))
@@ -110,13 +101,13 @@ def planned(mesh: TriangleMesh, order: int, rays: int | None, tolerance: float |
     if tolerance is None:
         return Planned(Plan("embree", rays=rays, reason="A number of rays was asked for: they are traced from every "
                                                         "point."), scene, None, every)
-    threads, points, enough = threads or default_threads(), len(mesh.points), tolerance
+    threads, points, enough = threads or default_threads(), len(mesh.lit()), tolerance
     ways = list((yield from costs.ways(candidates, threads, points)).values())
 
-    def without_rays(found: Pilot, safe: float = 1.0) -> tuple[Plan, Bands] | None:
+    def without_rays(found: Pilot) -> tuple[Plan, Bands] | None:
         if not whole:
-            return unshadowed_bands(found, order, enough, safe)
-        plan = unshadowed(found, enough, safe)
+            return unshadowed_bands(found, order, enough)
+        plan = unshadowed(found, enough)
         return (plan, every) if plan else None
 
     def with_rays(found: Pilot) -> tuple[Plan, Bands]:
@@ -125,15 +116,10 @@ def planned(mesh: TriangleMesh, order: int, rays: int | None, tolerance: float |
         return traced_bands(found, points, order, enough, ways)
 
     with workers(threads, looking(points, tolerance)) as pool:
-        few = merged(mesh, occluders) if scene is None and tolerance >= _ROUGH and dense(mesh, occluders) else None
-        if few:
-            rough = yield from look(few.mesh, few.scene, order, max(tolerance, 2 * _ROUGH), seed, pool, threads)
-            if chosen := without_rays(rough, SAFE):
-                return Planned(chosen[0], None, rough.to_order(chosen[1].order), chosen[1], few)
         if scene is None:
             scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
         pilot = yield from look(mesh, scene, order, tolerance, seed, pool, threads)
-    plan, bands = (None if few else without_rays(pilot)) or with_rays(pilot)
+    plan, bands = without_rays(pilot) or with_rays(pilot)
     return Planned(plan, scene, pilot if bands.order == order else pilot.to_order(bands.order), bands)
 
 

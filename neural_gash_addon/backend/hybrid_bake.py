@@ -15,7 +15,7 @@ from . import spherical_harmonics as sh
 from .estimator import MAX_RAYS, RATE, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
 from .hybrid import SIZE, between, evenness, filtered, placed, second_curve
-from .pilot import Pilot, noise_beside, pilot_rays, sample_size
+from .pilot import Pilot, noise_beside, pilot_rays, relative, sample_size
 from .progress import run, scaled
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
@@ -248,14 +248,13 @@ class _Work:
         """
         here = ((blocked - one) * (blocked - two)).sum(1)
         open_sky = self.unshadowed[points]
-        energy = float(((open_sky - one) * (open_sky - two)).sum())
         squared = float(here.sum())
         if rays > self._sample_rays:
             was = ((traced[points] - one) * (traced[points] - two)).sum(1)
             apart, off = was - was.mean(), here - here.mean()
             noise = float(np.square(one - two).sum()) / 2 * noise_beside(self._sample_rays, rays) ** 2
             squared -= float(np.clip(apart @ off / max(apart @ apart, 1e-300), 0, 1)) * (float(was.sum()) - noise)
-        return float(max(squared, 0.0) / energy) ** 0.5 if energy > 0 else None
+        return relative(squared, ((open_sky - one) * (open_sky - two)).sum(1), open_sky)
 
 
 def _share(slope: NDArray, curvature: NDArray) -> NDArray:

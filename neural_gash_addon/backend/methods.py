@@ -134,6 +134,8 @@ def bake(mesh: TriangleMesh, method: str = "embree", order: int = 3, *, rays: in
         UserError: arguments out of range.
     """
     check(method, order, rays, tolerance)
+    if seed < 0 or (threads is not None and threads < 0):
+        raise UserError("Seed and threads are 0 or more.")
     entry = METHODS[method]
     direct = partial(entry.bake, mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed,
                      threads=threads, **({"whole": whole} if entry.plans else {}))

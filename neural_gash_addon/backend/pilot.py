@@ -30,6 +30,7 @@ _SETS = 8
 _UNEVEN = 1.1                 # of the noise of rays that are no power of two, and so no whole net, to that of such
 _BESIDES = 16.0               # what a point of these costs besides its rays, in rays
 _DARK = 1e-3                  # of the transfer in the open: less than this is as good as none
+_FEEBLE = 2.0                 # of light: sizes of points' energies beside their sum, from which on that is mostly noise
 _UNSEEN = 0.05                # of the noise: what differs less is not seen
 _SURE = 1.3                   # standard errors of a share that are added to it, to be above it in nine cases of ten
 
@@ -61,7 +62,7 @@ class Pilot:
     def beyond(self, order: int) -> tuple[float, float]:
         """What the bands from `order` on are of |T|, and a bound as of `most_blocked`; infinite in the dark."""
         lights, _ = self._energies()
-        if float(lights.sum()) <= _DARK ** 2 * float(np.square(self.unshadowed).sum()):
+        if dark(float(lights.sum()), self.unshadowed):
             return np.inf, np.inf
         return _part(lights[:, sh.coefficient_count(order):].sum(1), lights.sum(1))
 
@@ -77,17 +78,17 @@ class Pilot:
         return (self.unshadowed - one) * (self.unshadowed - two), one * two
 
     def error_of(self, coefficients: NDArray) -> float | None:
-        """The relative L2 error of transfer (N, K) of all points, by these; None in the dark.
+        """The relative L2 error of transfer (N, K) of all points, by these; None in the dark, or where little more than
+        noise is left of the light, which it is relative to.
 
         Both traces' noise is independent, so it cancels in the product. An error that is too small to be told from what
         is left of it (the standard error of its square) is said to be as large as that.
         """
         points, one, two = self.sample
         blocked = self.unshadowed - coefficients[points]
-        energy = float(self._energies()[0].sum())
         squares = ((blocked - one) * (blocked - two)).sum(1)
         least = float(np.square(squares).sum()) ** 0.5
-        return (max(float(squares.sum()), least) / energy) ** 0.5 if energy > 0 else None
+        return relative(max(float(squares.sum()), least), self._energies()[0].sum(1), self.unshadowed)
 
     def seconds(self, points: int, rays: float) -> float:
         """Of so many rays, or what takes as long, from each of some points."""
@@ -140,6 +141,22 @@ def twice(few: TriangleMesh, scene: Occluders, order: int, rays: int, seed: int,
     return one, two, twins.jobs(every, 0, rays)
 
 
+def dark(energy: float, unshadowed: NDArray) -> bool:
+    """Whether so much energy of transfer at some points is as good as none beside that in the open (n, K)."""
+    return energy <= _DARK ** 2 * float(np.square(unshadowed).sum())
+
+
+def relative(squared: float, lights: NDArray, unshadowed: NDArray) -> float | None:
+    """The root of a squared error beside the energies of transfer (n,) at the same points, (n, K) in the open.
+
+    None in the dark, or where little more than noise is left of the light.
+    """
+    energy = float(lights.sum())
+    if dark(energy, unshadowed) or float(np.abs(lights).sum()) > _FEEBLE * energy:
+        return None
+    return (max(squared, 0.0) / energy) ** 0.5
+
+
 def noise_beside(rays: float, others: float) -> float:
     """The noise of a plain bake with other rays, as a part of that with a power of two of them."""
     uneven = _UNEVEN if np.log2(others) % 1 else 1.0
@@ -152,7 +169,7 @@ def _said(sample: tuple[NDArray, NDArray, NDArray], turns: float, unshadowed: ND
     _, one, two = sample
     lights = ((unshadowed - one) * (unshadowed - two)).sum(1)
     energy = float(lights.sum())
-    if energy <= 0:
+    if dark(energy, unshadowed):
         return Pilot(np.inf, np.inf, np.inf, rays, 0.0, ray, traced, sample, np.inf, turns, unshadowed, threads)
     noise = float(np.square(one - two).sum()) / 2 / energy
     first, second = (np.diff(levelled(trace, unshadowed, -1), axis=0) for trace in (one, two))

@@ -3,8 +3,7 @@
 
 1. Where everything lies below the tangent plane of every point, nothing can be blocked: unshadowed transfer is exact,
    and neither a ray nor a scene is needed (`horizon`). A convex mesh is so.
-2. Else a pilot says how large shadows are, and what rays bring and cost (`pilot`). Where the scene that it traces would
-   take longer than it may, the mesh is merged first to see whether shadows are wanted at all (`merged`).
+2. Else a pilot says how large shadows are, and what rays bring and cost (`pilot`).
 3. Bands whose energy would not be seen are dropped (`bands`); the rest of the tolerance is for the others.
 4. Each candidate is given a number of rays that meets the tolerance, and a time; the cheapest is taken. What the noise
    becomes with other rays, and what a hybrid or a sparse bake saves, follow laws measured on meshes (below).
@@ -65,13 +64,10 @@ class Candidate:
     ways: Way | None      # None: where nothing is traced
 
 
-def unshadowed_bands(found: Pilot, order: int, tolerance: float, safe: float = 1.0) -> tuple[Plan, Bands] | None:
-    """Unshadowed transfer, if that is near enough, at the lowest order at which that and what is dropped are.
-
-    safe: what that error may be larger by.
-    """
+def unshadowed_bands(found: Pilot, order: int, tolerance: float) -> tuple[Plan, Bands] | None:
+    """Unshadowed transfer, if that is near enough, at the lowest order at which that and what is dropped are."""
     for fewer in range(bands.LEAST_ORDER, order + 1):
-        if safe * found.without_shadows(fewer)[1] <= tolerance:
+        if found.without_shadows(fewer)[1] <= tolerance:
             return _unshadowed(found.to_order(fewer)), bands.chosen(fewer, order, tolerance, _parts(found, order))
     return None
 
@@ -97,9 +93,9 @@ def _parts(found: Pilot, order: int) -> list[tuple[float, float]]:
     return [found.beyond(fewer) for fewer in range(order)]
 
 
-def unshadowed(found: Pilot, tolerance: float, safe: float = 1.0) -> Plan | None:
-    """Unshadowed transfer, if that is near enough, all bands of it; safe: what its error may be larger by."""
-    return _unshadowed(found) if safe * found.most_blocked <= tolerance else None
+def unshadowed(found: Pilot, tolerance: float) -> Plan | None:
+    """Unshadowed transfer, if that is near enough, all bands of it."""
+    return _unshadowed(found) if found.most_blocked <= tolerance else None
 
 
 def cheapest(found: Pilot, points: int, tolerance: float, ways: Ways, asked: float | None = None,

@@ -14,7 +14,7 @@ from neural_gash_addon.backend.pilot import Pilot
 from neural_gash_addon.backend.record import BakeRecord
 from neural_gash_addon.backend.transfer import Transfer
 
-from .shapes import cube, sphere, torus
+from .shapes import cube, grid, sphere, torus
 
 WAYS = [each.ways for each in methods.candidates().values() if each.ways]
 
@@ -129,6 +129,36 @@ def test_a_number_of_rays_that_misses_the_tolerance_is_not_the_last_word(monkeyp
     rays[0] = 256
     enough = bake(mesh, method="auto", tolerance=0.05)
     assert enough.record.plan.startswith("So many.") and enough.record.rays_per_point == 256
+
+
+def test_layers_and_parts_far_apart_shadow_each_other_on_dense_meshes():
+    """However little of the whole their distance is, or however much: nothing coarser than the mesh is looked at."""
+    positions, triangles = grid(100)
+    sheets = TriangleMesh.from_triangles(np.concatenate([positions, positions + [0, 0, 0.01]]),
+                                         np.concatenate([triangles, triangles + len(positions)]))
+    knot, faces = torus(sections=160)
+    apart = TriangleMesh.from_triangles(np.concatenate([knot, knot + [30 * np.ptp(knot), 0, 0]]),
+                                        np.concatenate([faces, faces + len(knot)]))
+    for mesh in (sheets, apart):
+        found = bake(mesh, method="auto", tolerance=0.1)
+        rows = np.arange(0, len(mesh.points), 37)
+        few = replace(mesh, points=mesh.points[rows], normals=mesh.normals[rows], clearance=mesh.clearance[rows])
+        reference = bake(few, method="embree", rays=2048, seed=9).coefficients
+        assert found.record.method != "analytic" and metrics.rel_l2(found.coefficients[rows], reference) < 0.13
+
+
+def test_in_the_dark_no_error_is_claimed():
+    positions, triangles = torus(sections=64)
+    mesh = TriangleMesh.from_triangles(positions, triangles)
+    wall, faces = cube(subdivisions=0)
+    found = bake(mesh, method="auto", tolerance=0.2, occluders=[((wall - wall.mean(0)) * 50, faces)])
+    assert found.record.error_estimate is None and np.abs(found.coefficients).max() < 1e-6
+
+
+@pytest.mark.parametrize("wrong", [{"threads": -1}, {"seed": -1}])
+def test_neither_threads_nor_a_seed_are_less_than_none(wrong):
+    with pytest.raises(UserError, match="0 or more"):
+        bake(TriangleMesh.from_triangles(*torus()), method="auto", tolerance=0.1, **wrong)
 
 
 def test_networks_are_candidates_where_their_usual_error_is_within_the_tolerance(monkeypatch, request):
