@@ -63,3 +63,29 @@ def test_quick_form(tmp_path):
         == sorted(row[:6] for row in rows if row[method] == "analytic")
     assert [row for row in found if row[method] != "analytic"] == [row for row in rows if row[method] != "analytic"]
     assert len(again) == 2 * len(results["blocks"])
+
+
+def test_what_is_measured_later_has_the_time_that_its_ratio_says(tmp_path):
+    """And rows from before a column was there are read."""
+    sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+    import chart_measure
+
+    def row(method, seconds, ratio, rays=None, tolerance=None):
+        known = {"method": method, "order": 3, "threads": 2, "rays": rays, "seconds": seconds, "ratio": ratio,
+                 "tolerance": tolerance}
+        return [known.get(column) for column in chart_measure.COLUMNS]
+
+    def block(*rows):
+        return {"key": "base knot", "mesh": "knot", "category": "none", "sweep": "base", "rows": list(rows)}
+
+    path = tmp_path / "results.json"
+    chart_measure.save(path, [block(row("embree", 0.2, 1.0, 64), row("hybrid", 0.3, 1.5, 64)),
+                              block(row("auto", 5.0, 2.5, tolerance=0.1))])
+    rows = {row["method"]: row for row in chart_measure.rows_of(chart_measure.load(path))}
+    assert rows["hybrid"]["seconds"] == 0.3 and rows["auto"]["seconds"] == pytest.approx(0.5)
+    text = json.loads(path.read_text())
+    for each in text["blocks"]:
+        each["rows"] = [values[:-1] for values in each["rows"]]
+    text["columns"].remove("tolerance")
+    path.write_text(json.dumps(text))
+    assert all(row["tolerance"] is None for row in chart_measure.rows_of(chart_measure.load(path)))
