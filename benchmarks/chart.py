@@ -51,16 +51,14 @@ def _setting(row: chart_draw.Row) -> chart_draw.Key:
 
 
 def memory(rows: list[chart_draw.Row]) -> str:
-    """Seconds and peak memory by size, with the rays or the tolerance that memory was measured with: a table in
-    Markdown.
-    """
+    """Seconds and peak memory by size, with 64 rays or a tolerance of 5 % where there are any: a table in Markdown."""
     sizes = sorted({row["points"] for row in rows if row["sweep"] == "scale"})
     lines = ["| method | " + " | ".join(f"{size:,} vertices" for size in sizes) + " |", "|---" * (1 + len(sizes)) + "|"]
     for method in METHODS:
         cells = []
         for size in sizes:
             own = [row for row in rows if row["sweep"] == "scale" and row["method"] == method and row["points"] == size
-                   and row["rays"] in (None, 64) and row["tolerance"] in (None, chart_measure.MEMORY_TOLERANCE)]
+                   and row["rays"] in (None, 64) and row["tolerance"] in (None, 0.05)]
             if not own:
                 cells.append("")
             elif isinstance(own[0]["memory_mb"], float | int):
@@ -93,7 +91,11 @@ def main() -> int:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "results.json"
     cases = chart_measure.quick_cases() if arguments.quick else chart_measure.full_cases()
-    blocks = chart_measure.load(path)
+    try:
+        blocks = chart_measure.load(path)
+    except (ValueError, LookupError, TypeError) as error:
+        print(f"{path} is no results of a chart ({error}): move it away, or run with another --out.", file=sys.stderr)
+        return 1
     if arguments.again:
         blocks = chart_measure.without(blocks, arguments.again)
     if not arguments.draw:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from ambient import cycles_openness
-from memory import peak
+from memory import Watch
 from meshes import FOLDER, named
 from numpy.typing import NDArray
 from peers import Open3D, Trimesh
@@ -37,7 +37,6 @@ ORDER = 3
 RAYS = (2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
 FEW = (2, 8, 32, 64, 128, 512)   # of the sweeps that only show what one thing changes
 PEER_RAYS = (4, 16, 64, 256)
-MEMORY_TOLERANCE = 0.05          # of a method that plans, where others have BASELINE_RAYS
 SAMPLE = 4096                    # points of a mesh, or all, at which errors are measured
 REFERENCE_SEED, SEED, ROUNDS = 77, 0, 3
 SIDE = 256                       # texels of a texture
@@ -131,6 +130,24 @@ def _with_peers(mesh: TriangleMesh, ours: Bake) -> Bake:
     return bake
 
 
+class _Watched:
+    """A bake whose memory is watched in the first run of each setting."""
+
+    def __init__(self, bake: Bake) -> None:
+        self._bake = bake
+        self.peaks: dict[Setting, float] = {}  # MB over what was there before: the mesh, and a surface's UVs
+
+    def __call__(self, setting: Setting, seed: int) -> Generator[float, None, tuple[NDArray, BakeRecord | None]]:
+        running = self._bake(setting, seed)
+        return running if setting in self.peaks else self._watched(setting, running, Watch())
+
+    def _watched(self, setting: Setting, running: Generator[float, None, tuple[NDArray, BakeRecord | None]],
+                 watch: Watch) -> Generator[float, None, tuple[NDArray, BakeRecord | None]]:
+        found = yield from running
+        self.peaks[setting] = watch.peak()
+        return found
+
+
 def _warm_peers(settings: Sequence[Setting]) -> None:
     """Run each peer once on a small knot, so that no time has its import."""
     bake = _with_peers(named("knot 100"), compare.vertex_bake(named("knot 100")))
@@ -191,15 +208,6 @@ def measure(case: Case, lights: list[NDArray], only: frozenset[str] = frozenset(
     if not whole_table:
         settings = [setting for setting in settings if setting.method in only
                     or setting == compare.baseline(setting.order, setting.threads)]
-    memory: dict[str, dict[str, float] | str] = {}
-    if case.sweep == "scale" or (case.sweep == "base" and not case.quick):
-        # first, so that what the machine has no room for is not tried here
-        for name in dict.fromkeys(setting.method for setting in settings if setting.method in only):
-            entry = methods.METHODS[name]
-            rays = compare.BASELINE_RAYS if entry.traces and not entry.plans else None
-            memory[name] = peak(name, case.mesh, ORDER, rays, MEMORY_TOLERANCE if entry.plans else None)
-            yield 0.0
-        settings = [setting for setting in settings if not isinstance(memory.get(setting.method), str)]
     sees = methods.METHODS["embree"].sees
     assert sees is not None
     scene = sees(points, ())
@@ -215,25 +223,20 @@ def measure(case: Case, lights: list[NDArray], only: frozenset[str] = frozenset(
         if case.sweep == "peers" and whole_table:
             whole = _with_peers(mesh, bake)
             _warm_peers(own)
+        watched = _Watched(whole)
         rounds = 1 if case.quick or len(mesh.points) > 500_000 else ROUNDS
-        found = yield from scaled(compare.compare(whole, own, truth, lights, rounds, SEED),
+        found = yield from scaled(compare.compare(watched, own, truth, lights, rounds, SEED),
                                    start + 0.3 * share, 0.7 * share)
-        out += [_row(case, len(points.points), m, note) for m in found if whole_table or m.setting.method in only]
+        out += [_row(case, len(points.points), m, note, watched.peaks.get(m.setting))
+                for m in found if whole_table or m.setting.method in only]
         if whole_table:
             out.append({"points": len(points.points), "method": "reference", "order": order,
                         "rays": compare.REFERENCE_RAYS, **truth.floor(lights)})
-    for name, got in memory.items():
-        if isinstance(got, str):
-            out.append({"points": len(mesh.points), "method": name, "order": ORDER, "note": got})
-            continue
-        for row in out:
-            if row["method"] == name:
-                row["memory_mb"] = got["baked"]
     return {"key": case.key, "mesh": case.mesh, "category": case.category, "sweep": case.sweep, **about(),
             "rows": [[_short(row.get(column)) for column in COLUMNS] for row in out]}
 
 
-def _row(case: Case, points: int, found: Measurement, note: str) -> dict[str, Any]:
+def _row(case: Case, points: int, found: Measurement, note: str, peak: float | None) -> dict[str, Any]:
     setting = found.setting
     figures = {name: getattr(found, name) for name in
                ("ratio", "srr", "rel_l2", "openness", "relit_mean", "relit_worst", "claimed")}
@@ -242,6 +245,7 @@ def _row(case: Case, points: int, found: Measurement, note: str) -> dict[str, An
             "target": "texture" if case.sweep == "texture" else "vertices",
             "seconds": found.median, "least": min(found.seconds, default=None),
             "most": max(found.seconds, default=None), "runs": len(found.seconds), "note": found.refused or note,
+            "memory_mb": peak,
             **figures}
 
 

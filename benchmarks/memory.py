@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Peak memory of a bake, in a process of its own."""
+"""Peak memory of a bake, in a process of its own or in this one."""
 from __future__ import annotations
 
+import ctypes
+import gc
 import json
 import resource
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from table import Table
@@ -21,7 +24,29 @@ def _megabytes(field: str) -> float:
         return next(int(line.split()[1]) for line in file if line.startswith(field)) * 1024 / 1e6
 
 
-def _child(method: str, mesh_name: str, order: int, rays: int | None, tolerance: float | None) -> None:
+class Watch:
+    """Peak memory of this process from here on, over what it holds now."""
+
+    def __init__(self) -> None:
+        """Give back what is free, so that what is taken again counts; NaN where there is no Linux."""
+        self._held = float("nan")
+        gc.collect()
+        with suppress(OSError, AttributeError):  # another system, or another library of C
+            ctypes.CDLL(None).malloc_trim(0)
+            _peak_anew()
+            self._held = _megabytes("VmRSS")
+
+    def peak(self) -> float:
+        """MB."""
+        return max(_megabytes("VmHWM") - self._held, 0.0) if self._held == self._held else float("nan")
+
+
+def _peak_anew() -> None:
+    """VmHWM counts from here on."""
+    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+
+
+def _child(method: str, mesh_name: str, order: int, rays: int | None) -> None:
     """Build a mesh, bake it, report."""
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
     import trimesh  # noqa: F401  which reads files, and is no part of a bake
@@ -33,14 +58,13 @@ def _child(method: str, mesh_name: str, order: int, rays: int | None, tolerance:
     start = _megabytes("VmRSS")
     mesh = named(mesh_name)
     built, held = _megabytes("VmHWM"), _megabytes("VmRSS")
-    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak counts anew from here
-    transfer = methods.run(methods.bake(mesh, method, order, rays=rays, tolerance=tolerance))
+    _peak_anew()
+    transfer = methods.run(methods.bake(mesh, method, order, rays=rays))
     print(json.dumps({"vertices": len(mesh.points), "seconds": transfer.record.seconds, "built": built - start,
                       "held": held - start, "baked": _megabytes("VmHWM") - start}))
 
 
-def peak(method: str, mesh: str, order: int, rays: int | None, tolerance: float | None = None
-         ) -> dict[str, float] | str:
+def peak(method: str, mesh: str, order: int, rays: int | None) -> dict[str, float] | str:
     """Vertices, seconds, and MB over the process's start: built, held, baked. Or why there are none.
 
     mesh: a name for `meshes.named`.
@@ -48,7 +72,7 @@ def peak(method: str, mesh: str, order: int, rays: int | None, tolerance: float 
     if not Path("/proc/self/status").exists():
         return "needs Linux's /proc"
     try:
-        done = subprocess.run([sys.executable, __file__, method, mesh, str(order), str(rays or 0), str(tolerance or 0)],
+        done = subprocess.run([sys.executable, __file__, method, mesh, str(order), str(rays or 0)],
                               capture_output=True, text=True, check=False, timeout=LONGEST)
     except subprocess.TimeoutExpired:
         return f"more than {LONGEST} s"
@@ -75,4 +99,4 @@ def measure(table: Table, quick: bool) -> None:
 
 
 if __name__ == "__main__":
-    _child(sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4]) or None, float(sys.argv[5]) or None)
+    _child(sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4]) or None)

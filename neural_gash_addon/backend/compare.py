@@ -165,7 +165,7 @@ def compare(bake: Bake, settings: Sequence[Setting], truth: Reference, lights: S
 
     Args:
         bake: gives all points' coefficients (N, K) and the record of a setting with a seed. Coefficients (N, 1) are
-            of openness alone.
+            of openness alone. Timed is what it yields and returns, not the call itself.
         settings: with `baseline` among them; taken in another order in each round.
         truth: of some of the points. lights: each (K, 3) or more; their first K count.
         rounds: how often each is run, but those that have had ENOUGH seconds are not run again.
@@ -190,9 +190,10 @@ def compare(bake: Bake, settings: Sequence[Setting], truth: Reference, lights: S
             yield start
             if refused[index] or sum(run[1] for run in runs[index]) > ENOUGH:
                 continue
+            baking = bake(settings[index], seed + number)
             began = time.perf_counter()
             try:
-                found, record = yield from scaled(bake(settings[index], seed + number), start, share)
+                found, record = yield from scaled(baking, start, share)
             except UserError as error:
                 refused[index] = str(error)
                 continue
