@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from . import sampling
 from . import spherical_harmonics as sh
 from .geometry import CORNER, TEXEL, Surface, TriangleMesh
-from .pilot import pilot_rays, twice
+from .pilot import dark, pilot_rays, twice
 from .raster import Coverage
 from .raycast import Occluders
 from .texels import texel_points
@@ -23,9 +23,9 @@ from .workers import workers
 
 _POINTS = 96
 _FACES = 8192         # some of them all, among which points are chosen by area
-_MOST_RAYS = 32       # of each trace of them,
+_MOST_RAYS = 64       # of each trace of them
+_SURE = 2.5           # standard errors of their noise that an edge is above
 _OWN_NOISE = 1.25     # of the tolerance: what corners that just keep to it may differ by inside faces that hold no edge
-_DARK = 1e-3          # of the transfer in the open: less than this on the whole is not seen
 
 
 def domain(mesh: TriangleMesh) -> str:
@@ -40,6 +40,9 @@ def domain(mesh: TriangleMesh) -> str:
 def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray, order: int, tolerance: float,
                  seed: int, threads: int) -> Generator[float, None, float | None]:
     """The error inside faces of what their corners say, relative L2, without the noise of the rays that measure it.
+
+    What the noise that is left may explain is not counted as `missed`; an error too small to be told from it is said to
+    be as large as that, or as what is not missed.
 
     Args:
         coefficients: (N, K) of the points of the mesh. scene: what blocks, the mesh first.
@@ -64,10 +67,16 @@ def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray, or
         *blocked, _ = yield from twice(seen, scene, order, rays, seed, pool, threads)
     one, two = (open_sky - trace for trace in blocked)
     energy = float((one * two).sum())
-    if energy <= _DARK ** 2 * float(np.square(open_sky).sum()):
+    if dark(energy, open_sky):
         return None
     baked = np.einsum("nc,nck->nk", weights, coefficients[_of_corner(mesh, faces)].astype(np.float64))
-    return float(max(float(((one - baked) * (two - baked)).sum()), 0.0) / energy) ** 0.5
+    squared = float(((one - baked) * (two - baked)).sum()) / energy
+    # of the product of two errors with one variance, of which (one - two)^2 is twice, and its square 12 times its own
+    unsure = float(((one - two) ** 4).sum() / 12) ** 0.5 / energy
+    most = (_OWN_NOISE * tolerance) ** 2
+    if squared > most + _SURE * unsure:
+        return squared ** 0.5
+    return min(max(squared, unsure), most) ** 0.5
 
 
 def missed(error: float, tolerance: float) -> bool:
@@ -78,9 +87,9 @@ def missed(error: float, tolerance: float) -> bool:
 def said(error: float, tolerance: float, side: int = 0) -> str:
     """One sentence of it; side: of the texture that was baked for it."""
     if not missed(error, tolerance):
-        return f"Shadows inside faces follow their corners to {max(100 * error, 1):.0f} %: vertices are enough."
+        return f"Shadows inside faces follow their corners to {100 * error:.2g} %: vertices are enough."
     texture = f"a texture of {side} has them." if side else "a texture would have them."
-    return f"Shadow edges inside faces are missed by their corners ({100 * error:.0f} %): {texture}"
+    return f"Shadow edges inside faces are missed by their corners ({100 * error:.2g} %): {texture}"
 
 
 def _of_corner(mesh: TriangleMesh, faces: NDArray) -> NDArray[np.int32]:

@@ -2,10 +2,12 @@
 """What `auto` says of domain and target: shadows inside faces that corners miss, and the texture that has them."""
 import re
 
+import numpy as np
 import pytest
 
-from neural_gash_addon.backend import methods
+from neural_gash_addon.backend import advice, methods
 from neural_gash_addon.backend.geometry import TriangleMesh
+from neural_gash_addon.backend.raycast import Occluders
 
 from .shapes import cube, grid, sphere, torus
 
@@ -51,3 +53,15 @@ def test_split_normals_without_corners_and_darkness_give_no_sentence():
     assert len(sentences(bake(mesh, tolerance=0.1).record)) == 3
     dark = TriangleMesh.from_triangles(sphere(3)[0], sphere(3)[1][:, ::-1])
     assert len(sentences(bake(dark, tolerance=0.1).record)) == 2
+
+
+def test_noise_alone_wants_no_texture_and_an_edge_does():
+    """A dense ball with bumps, whose shadows have no edge, asked twenty times at tolerances near its noise."""
+    positions, triangles = sphere(5)
+    ball = TriangleMesh.from_triangles(positions * (1 + 0.03 * np.cos(9 * positions).sum(1, keepdims=True)), triangles)
+    for mesh, others, missed in ((ball, [], False), (TriangleMesh.from_triangles(*grid(12)), [TABLE], True)):
+        scene = Occluders([(mesh.positions, mesh.triangles), *others])
+        baked = methods.run(methods.bake(mesh, "embree", 3, rays=1024, seed=7, scene=scene)).coefficients
+        for tolerance in (0.01, 0.005):
+            found = [methods.run(advice.inside_faces(mesh, scene, baked, 3, tolerance, seed, 1)) for seed in range(20)]
+            assert [advice.missed(error, tolerance) for error in found] == [missed] * 20 and min(found) > 0
