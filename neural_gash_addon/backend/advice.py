@@ -87,9 +87,13 @@ def missed(error: float, tolerance: float) -> bool:
 def said(error: float, tolerance: float, side: int = 0) -> str:
     """One sentence of it; side: of the texture that was baked for it."""
     if not missed(error, tolerance):
-        return f"Shadows inside faces follow their corners to {100 * error:.2g} %: vertices are enough."
+        return f"Shadows inside faces follow their corners to {_percent(error)}: vertices are enough."
     texture = f"a texture of {side} has them." if side else "a texture would have them."
-    return f"Shadow edges inside faces are missed by their corners ({100 * error:.2g} %): {texture}"
+    return f"Shadow edges inside faces are missed by their corners ({_percent(error)}): {texture}"
+
+
+def _percent(error: float) -> str:
+    return f"{100 * error:.0f} %" if error > 0.1 else f"{100 * error:.2g} %"
 
 
 def _of_corner(mesh: TriangleMesh, faces: NDArray) -> NDArray[np.int32]:

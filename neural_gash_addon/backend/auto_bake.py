@@ -111,6 +111,9 @@ def planned(mesh: TriangleMesh, order: int, rays: int | None, tolerance: float |
         return (plan, every) if plan else None
 
     def with_rays(found: Pilot) -> tuple[Plan, Bands]:
+        if not found.scale:
+            return Plan("embree", tolerance=enough,
+                        reason="Hardly any light comes in: rays from every point look for it."), every
         if whole:
             return cheapest(found, points, enough, ways), every
         return traced_bands(found, points, order, enough, ways)

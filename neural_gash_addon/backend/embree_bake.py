@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from . import spherical_harmonics as sh
 from .estimator import MAX_RAYS, RATE, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
-from .pilot import Pilot
+from .pilot import Pilot, dark, least_scale
 from .progress import scaled
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
@@ -56,7 +56,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
             block = lit[start:start + BLOCK]
             done, share = start / len(lit), len(block) / len(lit)
             work = _trace_block(estimator, block, order, rays, None if scale is None or tolerance is None
-                                else (tolerance * scale) ** 2, pool, threads)
+                                else (tolerance * max(scale, least_scale(order))) ** 2, pool, threads)
             coefficients[block], rays_of_point[block] = yield from scaled(work, 0.95 * done, 0.95 * share)
         if pilot is not None:
             error = pilot.error_of(coefficients)
@@ -153,7 +153,7 @@ def _measured_error(mesh: TriangleMesh, scene: Occluders, order: int, seed: int,
     """Relative L2 error of the bake, from a second, independent bake of a sample of its points.
 
     Two independent estimates with the same rays differ by sqrt(2) standard errors; nothing is
-    assumed of how fast the error falls.
+    assumed of how fast the error falls. None in the dark.
     """
     size = min(len(lit), max(fewest, min(REPLICATES, len(lit) // 16), min(_MOST, len(lit) // 32)))
     rng = np.random.default_rng([seed, 1])
@@ -170,4 +170,5 @@ def _measured_error(mesh: TriangleMesh, scene: Occluders, order: int, seed: int,
         squared += float(np.square(again - coefficients[points]).sum()) / 2
         traced += len(points) * int(rays)
     energy = float(np.square(coefficients[sample], dtype=np.float64).sum())
-    return (squared / energy) ** 0.5 if energy else None, traced
+    open_sky = sh.cosine_lobe(mesh.normals[sample], order)
+    return None if dark(energy, open_sky) else (squared / energy) ** 0.5, traced

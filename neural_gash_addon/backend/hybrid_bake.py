@@ -15,7 +15,7 @@ from . import spherical_harmonics as sh
 from .estimator import MAX_RAYS, RATE, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
 from .hybrid import SIZE, between, evenness, filtered, placed, second_curve
-from .pilot import Pilot, noise_beside, pilot_rays, relative, sample_size
+from .pilot import Pilot, dark, noise_beside, pilot_rays, relative, sample_size
 from .progress import run, scaled
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
@@ -58,8 +58,8 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     """Trace `mesh` against itself and `occluders`, and take from neighbours; arguments as `methods.bake`.
 
     With a tolerance there are more rays until the measured error is within it, or they are MAX_RAYS. Of fewer than
-    FEWEST points, and of leaves and wires, up to twice the rays are traced, and the network is not asked. Of others,
-    one ray from each point is two from every other one.
+    FEWEST points, and of leaves and wires, up to twice the rays are traced, and the network is not asked; nor is it in
+    the dark, with a tolerance. Of others, one ray from each point is two from every other one.
 
     pilot: what is known beforehand; its points are those at which the error is measured.
     """
@@ -71,12 +71,16 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
         tolerance *= _MARGIN
     lit = mesh.lit()
     curve = _Curve(mesh, lit) if len(lit) >= FEWEST else None
-    if curve is None or evenness(curve.normals) < _LEAST_EVEN:
+
+    def plainly() -> Generator[float, None, Transfer]:
         more = None if rays is None else max(rays, min(2 * rays, MOST_DOUBLED))
         found = yield from embree_bake.bake(mesh, order, rays=more, tolerance=tolerance, occluders=occluders, seed=seed,
                                             threads=threads, scene=scene, pilot=pilot, fewest=_SAMPLE)
         return Transfer(found.coefficients, replace(found.record, method="hybrid", tolerance=asked,
                                                     seconds=time.perf_counter() - began))
+
+    if curve is None or evenness(curve.normals) < _LEAST_EVEN or (pilot is not None and not pilot.scale):
+        return (yield from plainly())
     coefficients = np.zeros((len(mesh.points), sh.coefficient_count(order)), np.float32)
     last = stop = rays or MAX_RAYS
     used, probes, left = 0, 0, 1.0
@@ -93,6 +97,8 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
             used, left, probes = stop, left - share, work.probes if pilot is None else 0
             blocked, here = work.blended(traced, taken, *sample.result())
             error = work.error(here, traced, used, *sample.result())
+            if tolerance is not None and work.dark(*sample.result()):
+                return (yield from plainly())
             if used == last or (error is not None and tolerance is not None and error <= tolerance):
                 coefficients[work.lit] = work.unshadowed - blocked
                 break
@@ -238,23 +244,31 @@ class _Work:
         moved += traced
         return moved, was + others * here
 
+    def dark(self, points: NDArray, one: NDArray, two: NDArray) -> bool:
+        """Whether it is, at the sample."""
+        open_sky = self.unshadowed[points]
+        return dark(float(((open_sky - one) * (open_sky - two)).sum()), open_sky)
+
     def error(self, blocked: NDArray, traced: NDArray[np.float32], rays: int, points: NDArray, one: NDArray,
               two: NDArray) -> float | None:
         """Relative L2 error at the sample, where `blocked` (s, K) is the answer and `traced` (n, K) had so many rays.
 
         Both traces' noise is independent, so it cancels in the product. Where the sample has less rays than the bake,
         though, what is left of it is most of the measure. The same measure of what was traced has the same noise, and
-        its truth is known otherwise: by how the two differ. So that is a control variate.
+        its truth is known otherwise: by how the two differ. So that is a control variate. An error that is too small to
+        be told from the standard error of its square is said to be as large as that.
         """
         here = ((blocked - one) * (blocked - two)).sum(1)
         open_sky = self.unshadowed[points]
-        squared = float(here.sum())
+        squared, least = float(here.sum()), float(np.square(here).sum()) ** 0.5
         if rays > self._sample_rays:
             was = ((traced[points] - one) * (traced[points] - two)).sum(1)
             apart, off = was - was.mean(), here - here.mean()
             noise = float(np.square(one - two).sum()) / 2 * noise_beside(self._sample_rays, rays) ** 2
-            squared -= float(np.clip(apart @ off / max(apart @ apart, 1e-300), 0, 1)) * (float(was.sum()) - noise)
-        return relative(squared, ((open_sky - one) * (open_sky - two)).sum(1), open_sky)
+            share = float(np.clip(apart @ off / max(apart @ apart, 1e-300), 0, 1))
+            squared -= share * (float(was.sum()) - noise)
+            least = float(np.square(off - share * apart).sum()) ** 0.5
+        return relative(max(squared, least), ((open_sky - one) * (open_sky - two)).sum(1), open_sky)
 
 
 def _share(slope: NDArray, curvature: NDArray) -> NDArray:

@@ -43,7 +43,7 @@ class Pilot:
     most_blocked: float   # and a bound of it that is met in nine cases of ten
     noise: float      # relative to |T|, of so many
     rays: int         # rays
-    scale: float      # root mean square of |T|
+    scale: float      # root mean square of |T|; 0 in the dark
     ray: float        # seconds of one, on one thread
     traced: int       # rays in all
     sample: tuple[NDArray, NDArray, NDArray]  # points (n,) along a curve, and the blocked part (n, K) of each trace
@@ -144,6 +144,11 @@ def twice(few: TriangleMesh, scene: Occluders, order: int, rays: int, seed: int,
 def dark(energy: float, unshadowed: NDArray) -> bool:
     """Whether so much energy of transfer at some points is as good as none beside that in the open (n, K)."""
     return energy <= _DARK ** 2 * float(np.square(unshadowed).sum())
+
+
+def least_scale(order: int) -> float:
+    """Root mean square of |T| below which it is dark: a tolerance is of no less than that."""
+    return _DARK * float(np.linalg.norm(sh.cosine_lobe(np.array([[0.0, 0.0, 1.0]]), order)))
 
 
 def relative(squared: float, lights: NDArray, unshadowed: NDArray) -> float | None:

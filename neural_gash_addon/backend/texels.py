@@ -51,9 +51,8 @@ def texel_points(surface: Surface, coverage: Coverage, normal_maps: Sequence[Nor
         points[part] = flat - np.einsum("nc,ncx->nx", weights * below, shading)
         smooth = unit(np.einsum("nc,ncx->nx", coverage.centres[part], shading))
         normals[part] = smooth
-        inwards = places.mean(1) - flat
-        inwards -= (inwards * smooth).sum(1, keepdims=True) * smooth
-        clearance[part] = smooth + INSET * unit(inwards)
+        # along the face: what is at right angles to a normal that leans out of it may lead through it
+        clearance[part] = smooth + INSET * unit(places.mean(1) - flat)
     for normal_map in normal_maps:
         mapped = np.flatnonzero(normal_map.triangles[coverage.faces])
         for start in range(0, len(mapped), _AT_ONCE):
