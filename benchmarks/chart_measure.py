@@ -274,6 +274,8 @@ def load(path: Path) -> list[dict[str, Any]]:
         return []
     found = json.loads(path.read_text())
     for block in found["blocks"]:
+        if not {"key", "mesh", "category", "sweep"} <= set(block):
+            raise ValueError("a block does not say what it is of")
         rows = [dict(zip(found["columns"], row, strict=True)) for row in block["rows"]]
         block["rows"] = [[row.get(column) for column in COLUMNS] for row in rows]
     return found["blocks"]

@@ -8,6 +8,7 @@ to be is measured on its own UV map (`resolution`).
 from __future__ import annotations
 
 from collections.abc import Generator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +24,17 @@ from .workers import workers
 
 _POINTS = 96
 _FACES = 8192         # some of them all, among which points are chosen by area
-_MOST_RAYS = 64       # of each trace of them
-_SURE = 2.5           # standard errors of their noise that an edge is above
+# Rays of each trace of them at most; or as many as a pilot has at _EASIER of the tolerance, so that edges stand out.
+_MOST_RAYS, _EASIER = 64, 4.0
+_SURE = 2.0           # standard errors of their noise that an edge is above
 _OWN_NOISE = 1.25     # of the tolerance: what corners that just keep to it may differ by inside faces that hold no edge
+
+
+class Inside(NamedTuple):
+    """How far what the corners of faces say is from what is inside them."""
+
+    error: float  # relative L2, without the noise of the rays that measured it, or as large as can be told from that
+    missed: bool  # whether that is more than the tolerance allows, and more than noise explains
 
 
 def domain(mesh: TriangleMesh) -> str:
@@ -38,11 +47,8 @@ def domain(mesh: TriangleMesh) -> str:
 
 
 def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray, order: int, tolerance: float,
-                 seed: int, threads: int) -> Generator[float, None, float | None]:
-    """The error inside faces of what their corners say, relative L2, without the noise of the rays that measure it.
-
-    What the noise that is left may explain is not counted as `missed`; an error too small to be told from it is said to
-    be as large as that, or as what is not missed.
+                 seed: int, threads: int) -> Generator[float, None, Inside | None]:
+    """Look at points inside faces.
 
     Args:
         coefficients: (N, K) of the points of the mesh. scene: what blocks, the mesh first.
@@ -62,7 +68,8 @@ def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray, or
     faces = some[chosen]
     weights = np.stack([1 - u - v, u, v], 1)
     seen = _points(mesh, faces, weights)
-    rays, open_sky = min(pilot_rays(tolerance), _MOST_RAYS), sh.cosine_lobe(seen.normals, order)
+    rays = min(pilot_rays(tolerance), max(pilot_rays(_EASIER * tolerance), _MOST_RAYS))
+    open_sky = sh.cosine_lobe(seen.normals, order)
     with workers(threads, 2 * len(faces) * rays) as pool:
         *blocked, _ = yield from twice(seen, scene, order, rays, seed, pool, threads)
     one, two = (open_sky - trace for trace in blocked)
@@ -70,30 +77,25 @@ def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray, or
     if dark(energy, open_sky):
         return None
     baked = np.einsum("nc,nck->nk", weights, coefficients[_of_corner(mesh, faces)].astype(np.float64))
-    squared = float(((one - baked) * (two - baked)).sum()) / energy
-    # of the product of two errors with one variance, of which (one - two)^2 is twice, and its square 12 times its own
-    unsure = float(((one - two) ** 4).sum() / 12) ** 0.5 / energy
-    most = (_OWN_NOISE * tolerance) ** 2
-    if squared > most + _SURE * unsure:
-        return squared ** 0.5
-    return min(max(squared, unsure), most) ** 0.5
+    squared, most = float(((one - baked) * (two - baked)).sum()) / energy, (_OWN_NOISE * tolerance) ** 2
+    # The variance of (b + m) * (b + n), where noise m and n have a covariance C, is tr CC + 2 b C b. As if all of a
+    # point's coefficients erred as one, which is the most: (tr C)^2 + 2 b^2 tr C. |m - n|^2 is 2 tr C, its square 12
+    # of (tr C)^2; and b^2 is what is asked about, `most`.
+    noise = np.square(one - two).sum(1) / energy
+    unsure = (float(np.square(noise).sum()) / 12 + most * float(noise.mean())) ** 0.5
+    return Inside(max(squared, unsure) ** 0.5, squared > most + _SURE * unsure)
 
 
-def missed(error: float, tolerance: float) -> bool:
-    """Whether shadows inside faces are missed by their corners."""
-    return error > _OWN_NOISE * tolerance
-
-
-def said(error: float, tolerance: float, side: int = 0) -> str:
+def said(error: float, missed: bool, side: int = 0) -> str:
     """One sentence of it; side: of the texture that was baked for it."""
-    if not missed(error, tolerance):
+    if not missed:
         return f"Shadows inside faces follow their corners to {_percent(error)}: vertices are enough."
     texture = f"a texture of {side} has them." if side else "a texture would have them."
     return f"Shadow edges inside faces are missed by their corners ({_percent(error)}): {texture}"
 
 
 def _percent(error: float) -> str:
-    return f"{100 * error:.0f} %" if error > 0.1 else f"{100 * error:.2g} %"
+    return f"{100 * error:.0f} %" if error > 0.1 else f"{max(100 * error, 0.01):.2g} %"
 
 
 def _of_corner(mesh: TriangleMesh, faces: NDArray) -> NDArray[np.int32]:

@@ -82,7 +82,8 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
                                      threads or default_threads())
         inside = yield from scaled(asking, 1, 0)
         if inside is not None:
-            record = replace(record, between_error=inside).also(advice.said(inside, tolerance))
+            record = replace(record, between_error=inside.error, between_missed=inside.missed).also(
+                advice.said(*inside))
     if pilot is not None:
         probes += pilot.traced
     return Transfer(transfer.coefficients, replace(record, probe_rays=probes, seconds=time.perf_counter() - began,

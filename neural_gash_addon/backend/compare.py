@@ -190,9 +190,9 @@ def compare(bake: Bake, settings: Sequence[Setting], truth: Reference, lights: S
             yield start
             if refused[index] or sum(run[1] for run in runs[index]) > ENOUGH:
                 continue
-            baking = bake(settings[index], seed + number)
-            began = time.perf_counter()
             try:
+                baking = bake(settings[index], seed + number)
+                began = time.perf_counter()
                 found, record = yield from scaled(baking, start, share)
             except UserError as error:
                 refused[index] = str(error)

@@ -72,12 +72,13 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     lit = mesh.lit()
     curve = _Curve(mesh, lit) if len(lit) >= FEWEST else None
 
-    def plainly() -> Generator[float, None, Transfer]:
+    def plainly(spent: int = 0) -> Generator[float, None, Transfer]:
         more = None if rays is None else max(rays, min(2 * rays, MOST_DOUBLED))
         found = yield from embree_bake.bake(mesh, order, rays=more, tolerance=tolerance, occluders=occluders, seed=seed,
                                             threads=threads, scene=scene, pilot=pilot, fewest=_SAMPLE)
-        return Transfer(found.coefficients, replace(found.record, method="hybrid", tolerance=asked,
-                                                    seconds=time.perf_counter() - began))
+        return Transfer(found.coefficients, replace(
+            found.record, method="hybrid", tolerance=asked, probe_rays=found.record.probe_rays + spent,
+            seconds=time.perf_counter() - began))
 
     if curve is None or evenness(curve.normals) < _LEAST_EVEN or (pilot is not None and not pilot.scale):
         return (yield from plainly())
@@ -95,10 +96,10 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
             share = left if tolerance is None else left / 2
             traced, taken = yield from scaled(work.trace(used, stop), 1 - left, share)
             used, left, probes = stop, left - share, work.probes if pilot is None else 0
+            if tolerance is not None and work.dark(*sample.result()):
+                return (yield from scaled(plainly(probes + used * len(lit)), 1 - left, left))
             blocked, here = work.blended(traced, taken, *sample.result())
             error = work.error(here, traced, used, *sample.result())
-            if tolerance is not None and work.dark(*sample.result()):
-                return (yield from plainly())
             if used == last or (error is not None and tolerance is not None and error <= tolerance):
                 coefficients[work.lit] = work.unshadowed - blocked
                 break

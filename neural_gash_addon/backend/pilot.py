@@ -29,7 +29,7 @@ _LEAST_RAYS, _MOST_RAYS = 8, 256
 _SETS = 8
 _UNEVEN = 1.1                 # of the noise of rays that are no power of two, and so no whole net, to that of such
 _BESIDES = 16.0               # what a point of these costs besides its rays, in rays
-_DARK = 1e-3                  # of the transfer in the open: less than this is as good as none
+DARK = 1e-3                  # of the transfer in the open: less than this is as good as none
 _FEEBLE = 2.0                 # of light: sizes of points' energies beside their sum, from which on that is mostly noise
 _UNSEEN = 0.05                # of the noise: what differs less is not seen
 _SURE = 1.3                   # standard errors of a share that are added to it, to be above it in nine cases of ten
@@ -143,12 +143,12 @@ def twice(few: TriangleMesh, scene: Occluders, order: int, rays: int, seed: int,
 
 def dark(energy: float, unshadowed: NDArray) -> bool:
     """Whether so much energy of transfer at some points is as good as none beside that in the open (n, K)."""
-    return energy <= _DARK ** 2 * float(np.square(unshadowed).sum())
+    return energy <= DARK ** 2 * float(np.square(unshadowed).sum())
 
 
 def least_scale(order: int) -> float:
     """Root mean square of |T| below which it is dark: a tolerance is of no less than that."""
-    return _DARK * float(np.linalg.norm(sh.cosine_lobe(np.array([[0.0, 0.0, 1.0]]), order)))
+    return DARK * float(np.linalg.norm(sh.cosine_lobe(np.array([[0.0, 0.0, 1.0]]), order)))
 
 
 def relative(squared: float, lights: NDArray, unshadowed: NDArray) -> float | None:

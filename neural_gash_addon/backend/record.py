@@ -18,7 +18,7 @@ LAMPS_BASIS = "; and + albedo * E / pi, E the irradiance from lamps, W/m^2, line
 _DAMAGED = "The record of this bake is damaged; bake again."
 # what JSON may hold for each kind of field
 _KINDS: dict[str, tuple[type, ...]] = {
-    "str": (str,), "int": (int,), "float": (int, float), "float | None": (int, float, type(None)),
+    "str": (str,), "int": (int,), "bool": (bool,), "float": (int, float), "float | None": (int, float, type(None)),
     "tuple[float, ...]": (list,)}
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -34,7 +34,7 @@ class BakeRecord:
     rays: int                         # that the coefficients are made of
     seed: int
     seconds: float                    # arrays to coefficients, wall clock
-    error_estimate: float | None      # rel L2, measured; None: nothing was sampled
+    error_estimate: float | None      # rel L2, measured; None: nothing was sampled, or it is dark
     probe_rays: int = 0               # traced besides, to measure the error and set the tolerance's scale
     tolerance: float | None = None    # rel L2 that was asked for; None: a ray count was
     occluders: str = "SELF"           # 'SELF', 'VISIBLE', a collection's name, or a JSON list of objects
@@ -46,7 +46,8 @@ class BakeRecord:
     single_faces: int = 0             # that lie alone in it, as xatlas could not chart them with their neighbours
     bounces: int = 0                  # of diffuse interreflection that were computed
     colours: int = 1                  # transfer is (N, K), or (N, K, 3) where light bounced off colours
-    between_error: float | None = None  # rel L2 inside faces of what vertices say, measured where it was planned
+    between_error: float | None = None  # rel L2 inside faces of what vertices say, measured where it was planned,
+    between_missed: bool = False      # and whether that is too much
     plan: str = ""                    # why so, where it was planned: one sentence for each choice
     lamps: str = ""                   # what tells the lamps, and all that they light, from others; '': none baked
     lamps_rays: int = 0               # paths that their irradiance is made of

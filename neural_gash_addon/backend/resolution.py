@@ -18,7 +18,7 @@ from . import methods
 from . import spherical_harmonics as sh
 from .errors import UserError
 from .geometry import Surface, TriangleMesh
-from .pilot import pilot_rays
+from .pilot import DARK, pilot_rays
 from .progress import scaled
 from .raster import Coverage, Layout
 from .raycast import Geometry, Occluders
@@ -30,7 +30,6 @@ MAX_FIT = 4096                    # the largest texture that an error asks for
 _POINTS = 4096                    # of the surface that are looked at
 _TIMES = 2                        # the rays of a pilot, from each and from its texels, for each of two traces
 _LEAST_RATE, _MOST_RATE = 0.5, 2.0  # powers of the size by which an error falls: at a shadow's edge, where smooth
-_DARK = 1e-3                      # of the transfer in the open: less than this on the whole is not seen
 _STEP = 16                        # texels to which sizes are rounded up
 
 Trial = Callable[[NDArray], Generator[float, None, int]]
@@ -60,7 +59,7 @@ def fitting_side(surface: Surface, uv: NDArray, *, error: float, method: str = "
                     rays=_TIMES * pilot_rays(error))
     yield 0.0
     exact = trace(points, first=0)
-    dark = _DARK ** 2 * float(np.square(sh.cosine_lobe(points.normals, order)).sum())
+    dark = DARK ** 2 * float(np.square(sh.cosine_lobe(points.normals, order)).sum())
     energy = max(float((exact[0] * exact[1]).sum()), dark)
     errors: list[float] = []
     for number, side in enumerate(TRIALS):

@@ -23,7 +23,7 @@ from . import spherical_harmonics as sh
 from .estimator import MAX_RAYS, RATE, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
 from .hybrid import levelled
-from .pilot import Pilot
+from .pilot import Pilot, dark, relative
 from .progress import scaled
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
@@ -218,18 +218,22 @@ class _Work:
         return points, one, two
 
     def _error(self, points: NDArray, one: NDArray, two: NDArray) -> float | None:
-        """Relative L2 error at points held back. Both traces' noise is independent, so it cancels in the product."""
+        """Relative L2 error at points held back; None in the dark, or where it can hardly be told from that.
+
+        Both traces' noise is independent, so it cancels in the product. An error that is too small to be told from the
+        standard error of its square is said to be as large as that.
+        """
         unshadowed = sh.cosine_lobe(self._mesh.normals[points], self._order)
         blocked = self._at(points, unshadowed)
-        energy = float(((unshadowed - one) * (unshadowed - two)).sum())
-        squared = float(((blocked - one) * (blocked - two)).sum())
-        return (max(squared, 0.0) / energy) ** 0.5 if energy > 0 else None
+        squares = ((blocked - one) * (blocked - two)).sum(1)
+        least = float(np.square(squares).sum()) ** 0.5
+        return relative(max(float(squares.sum()), least), ((unshadowed - one) * (unshadowed - two)).sum(1), unshadowed)
 
     def _noise(self, points: NDArray, one: NDArray, two: NDArray) -> float:
-        """Relative error of one of two traces, from how they differ."""
+        """Relative error of one of two traces, from how they differ; 0 in the dark."""
         unshadowed = sh.cosine_lobe(self._mesh.normals[points], self._order)
         energy = float(((unshadowed - one) * (unshadowed - two)).sum())
-        return (float(np.square(one - two).sum()) / 2 / energy) ** 0.5 if energy > 0 else 0.0
+        return 0.0 if dark(energy, unshadowed) else (float(np.square(one - two).sum()) / 2 / energy) ** 0.5
 
     def _traced(self, points: NDArray, rays: int) -> Generator[float, None, NDArray]:
         """The blocked part (n, K) at some points, with rays of their own."""

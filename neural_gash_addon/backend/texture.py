@@ -35,6 +35,7 @@ _POINTS = 4096           # of the surface, of which some say what order is enoug
 _TILE = 1 << 18          # texels of a tile, covered or not: some seconds of work
 _OURS = re.compile(r"\d{4}\.(npy|json)")
 _JOB = "job.json"
+_SCARCE = 1e-4           # of the energy of transfer: parts of a texture that have no more may have no known error
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,11 +236,18 @@ def _whole(records: Sequence[BakeRecord], energies: Iterable[float], lamps: Iter
 
 
 def _joint(errors: Sequence[float | None], energies: Iterable[float]) -> float | None:
-    """The relative L2 error of parts together; None where one of them has none."""
-    if any(error is None for error in errors):
+    """The relative L2 error of parts together; None where parts that have none are more than _SCARCE of the energy.
+
+    Those count as wholly wrong.
+    """
+    if all(error is None for error in errors):
         return None
     energy = np.array(list(energies))
-    return float((np.square(np.array(errors, float)) * energy).sum() / max(energy.sum(), 1e-300)) ** 0.5
+    whole, unknown = max(float(energy.sum()), 1e-300), np.array([error is None for error in errors])
+    if energy[unknown].sum() > _SCARCE * whole:
+        return None
+    squares = np.array([1.0 if error is None else error ** 2 for error in errors])
+    return float((squares * energy).sum() / whole) ** 0.5
 
 
 class _Store:

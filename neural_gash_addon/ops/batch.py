@@ -11,7 +11,7 @@ from pathlib import Path
 import bpy
 
 from ..backend import methods
-from ..backend.advice import missed, said
+from ..backend.advice import said
 from ..backend.atlas import Placed, place
 from ..backend.errors import UserError
 from ..backend.progress import scaled
@@ -108,8 +108,7 @@ def _bake(jobs: list[Job], share: bool, sizes: dict) -> Generator[float, None, l
         if job.texture is None:
             yield from baked(number, job.bake(), (_LOOKING if job.finer else 1) / len(jobs))
             found = results[number]
-            if job.finer and isinstance(found, Transfer) and found.record.between_error is not None and missed(
-                    found.record.between_error, found.record.tolerance or 1):
+            if job.finer and isinstance(found, Transfer) and found.record.between_missed:
                 finer[number] = job.finer
     if share and len(finer) > 1:
         began, part = time.perf_counter(), _PLACING * (1 - done)
@@ -140,8 +139,8 @@ def _textured(job: Job, sizes: dict) -> Generator[float, None, Transfer | Textur
 
 def _instead(vertices: BakeRecord, found: TextureTransfer) -> TextureTransfer:
     """A texture whose record says why it was not left at the vertices, and counts their time."""
-    assert vertices.between_error is not None and vertices.tolerance is not None
-    record = found.record.also(said(vertices.between_error, vertices.tolerance, found.record.side))
+    assert vertices.between_error is not None
+    record = found.record.also(said(vertices.between_error, vertices.between_missed, found.record.side))
     return replace(found, record=replace(record, seconds=record.seconds + vertices.seconds))
 
 

@@ -115,7 +115,8 @@ def test_memory_is_what_a_bake_takes_at_most():
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"columns": 1, "blocks": 2}',
-                                  '{"columns": [], "blocks": [{"rows": [[1]]}]}'])
+                                  '{"columns": [], "blocks": [{"rows": [[1]]}]}',
+                                  '{"columns": [], "blocks": [{"rows": []}]}'])
 def test_results_that_are_damaged_are_kept_and_told(tmp_path, text):
     path = tmp_path / "results.json"
     path.write_text(text)
