@@ -21,7 +21,7 @@ from .transfer import Transfer
 from .workers import default_threads, workers
 
 _PILOT_SHARE = 0.05  # of the progress
-_BY_THE_LAW = 1.1  # of the tolerance: what the error with a number of rays may seem to be, as the pilot errs too
+_BY_THE_LAW = 1.2  # of the tolerance: what the error with a number of rays may seem to be, as the pilot errs too
 _MANY = 1 << 18  # points that are baked at a time, where those that are looked at are but some of them
 
 
