@@ -6,19 +6,19 @@ near and face alike (octant of the normal, then a Z-order curve). Every so many 
 each gap whose ends differ most, until the error is within the tolerance. That error is measured in each round at fresh
 points that were held back, traced twice with rays of their own, so it has everything in it: noise and reconstruction.
 What is not blocked is exact everywhere, as in the other methods. Where points are too few for all this, every point is
-traced, as by `embree`.
+traced, as by `embree`; or few rays from every point, as by `hybrid`, where a pilot says that this costs far less.
 """
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import embree_bake
+from . import embree_bake, hybrid_bake
 from . import spherical_harmonics as sh
 from .estimator import MAX_RAYS, RATE, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
@@ -75,8 +75,12 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
                     probe_rays=work.probes, seconds=time.perf_counter() - began, error_estimate=error,
                     tolerance=tolerance))
         spent = traced + work.probes
-    every = yield from embree_bake.bake(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed,
-                                        threads=threads, scene=scene, pilot=pilot)
+    plainly: Callable[..., Generator[float, None, Transfer]] = embree_bake.bake
+    if pilot is not None and tolerance is not None and hybrid_bake.expected_rays(pilot, len(lit), tolerance) \
+            < pilot.needed_rays(tolerance) / 2:  # half: what the network costs besides
+        plainly = hybrid_bake.bake
+    every = yield from plainly(mesh, order, rays=rays, tolerance=tolerance, occluders=occluders, seed=seed,
+                               threads=threads, scene=scene, pilot=pilot)
     return replace(every, record=replace(every.record, method="sparse", probe_rays=every.record.probe_rays + spent,
                                          seconds=time.perf_counter() - began))
 

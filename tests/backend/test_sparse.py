@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The sparse bake: reconstruction against a plain twin, the error it reports, and what it saves."""
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from neural_gash_addon.backend import methods, metrics, sparse_bake
+from neural_gash_addon.backend import embree_bake, hybrid_bake, methods, metrics, sparse_bake
 from neural_gash_addon.backend import spherical_harmonics as sh
 from neural_gash_addon.backend.geometry import TriangleMesh
+from neural_gash_addon.backend.pilot import look
+from neural_gash_addon.backend.raycast import Occluders
+from neural_gash_addon.backend.workers import workers
 
 from .shapes import sphere, torus
 
@@ -23,7 +28,6 @@ def dense():
 @pytest.fixture(scope="module")
 def reference(dense):
     """A thinned-out reference: every 16th point, 1024 rays, a seed of its own."""
-    from dataclasses import replace
     rows = np.arange(0, len(dense.points), 16)
     few = replace(dense, points=dense.points[rows], normals=dense.normals[rows], clearance=dense.clearance[rows])
     return rows, bake(few, method="embree", rays=1024, seed=99).coefficients
@@ -64,6 +68,27 @@ def test_far_fewer_rays_than_a_bake_of_every_vertex(dense):
     every = bake(dense, method="embree", tolerance=0.03).record
     some = bake(dense, method="sparse", tolerance=0.03).record
     assert some.rays + some.probe_rays < every.rays / 4
+
+
+def test_what_a_plan_gives_up_is_baked_the_cheaper_way(dense, monkeypatch):
+    """With a pilot that expects the hybrid to need less than half of the rays, by that; else, and without, plainly."""
+    scene = Occluders([(dense.positions, dense.triangles)])
+    with workers(1) as pool:
+        seen = methods.run(look(dense, scene, 3, 0.05, 0, pool, 1))
+    known = {"rays": None, "tolerance": 0.05, "occluders": (), "seed": 0, "threads": 1, "scene": scene}
+    plainly, few = (methods.run(module.bake(dense, 3, pilot=seen, **known)) for module in (embree_bake, hybrid_bake))
+
+    def give_up(self, *_):
+        yield 0.0
+
+    monkeypatch.setattr(sparse_bake._Work, "refine", give_up)
+    found = methods.run(sparse_bake.bake(dense, 3, pilot=seen, **known))
+    assert found.record.method == "sparse" and found.record.rays < plainly.record.rays / 2
+    np.testing.assert_array_equal(found.coefficients, few.coefficients)
+    smooth_nowhere = replace(seen, varies=10.0)
+    for pilot in (smooth_nowhere, None):
+        found = methods.run(sparse_bake.bake(dense, 3, pilot=pilot, **known))
+        assert found.record.rays >= 0.9 * plainly.record.rays
 
 
 def test_points_few_enough_are_all_traced():
