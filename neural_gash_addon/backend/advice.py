@@ -48,7 +48,7 @@ def domain(mesh: TriangleMesh) -> str:
 
 def inside_faces(mesh: TriangleMesh, scene: Occluders, coefficients: NDArray, order: int, tolerance: float,
                  seed: int, threads: int) -> Generator[float, None, Inside | None]:
-    """Look at points inside faces.
+    """Look at points inside faces, by area: what rays see there, and what the faces' corners say.
 
     Args:
         coefficients: (N, K) of the points of the mesh. scene: what blocks, the mesh first.
