@@ -14,7 +14,7 @@ from .bands import Bands, all_of, of_open_sky
 from .geometry import TriangleMesh
 from .horizon import nothing_blocks
 from .pilot import Pilot, look, looking
-from .plan import Candidate, Plan, cheapest, traced_bands, unshadowed, unshadowed_bands
+from .plan import Candidate, Plan, cheapest, traced_bands, tried, unshadowed, unshadowed_bands
 from .progress import clocked, scaled
 from .raycast import Geometry, Occluders
 from .transfer import Transfer
@@ -125,7 +125,10 @@ def planned(mesh: TriangleMesh, order: int, rays: int | None, tolerance: float |
         if scene is None:
             scene = Occluders([(mesh.positions, mesh.triangles), *occluders], mesh.resolution)
         pilot = yield from look(mesh, scene, order, tolerance, seed, pool, threads)
-    plan, bands = without_rays(pilot) or with_rays(pilot)
+    picked = without_rays(pilot)
+    if picked is None:
+        pilot = yield from scaled(tried(mesh, scene, order, pilot, tolerance, seed, threads), 1, 0)
+    plan, bands = picked or with_rays(pilot)
     return Planned(plan, scene, pilot if bands.order == order else pilot.to_order(bands.order), bands)
 
 

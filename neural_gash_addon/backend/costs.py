@@ -21,20 +21,19 @@ import numpy as np
 
 from .exchange import atomic
 from .geometry import TriangleMesh
-from .pilot import Pilot, look, looking
-from .plan import Candidate, Plan, Way
+from .pilot import DENSE, Pilot, look, looking
+from .plan import Candidate, Plan, Way, tried
 from .progress import clocked, scaled
 from .raycast import Occluders
 from .workers import workers
 
-VERSION = 3          # raised whenever the constants of `plan` are others, or what is measured
-_SMALL, _LARGE = 1 << 13, 1 << 17  # points that are baked; so many for methods that are for dense meshes alone,
-_DENSE = 1 << 16     # before the first bake of so many
+VERSION = 4          # raised whenever the constants of `plan` are others, or what is measured
+_SMALL, _LARGE = 1 << 13, 1 << 17  # points that are baked; so many for methods that are for dense meshes alone
 _TOLERANCE, _ORDER = 0.1, 3
 _LOOKS, _RUNS = 9, 5  # of a pilot, whose median counts; and of a method, the least: other work makes it only longer
 # Over what is expected, on this mesh, where the constants of `plan` are from, with one thread. (A smooth mesh: from
 # few of its points the others can be read.)
-_THERE = {"embree": 1.02, "hybrid": 1.02, "sparse": 0.145}
+_THERE = {"embree": 1.02, "hybrid": 1.02, "sparse": 0.72}
 _USUAL = 0.95        # of what `plan` says bakes take, in the median of many meshes
 # A bake that takes so many times what is expected, or less than the reciprocal, is off, mostly by its mesh. So many in
 # a row, all too long or all too short, are by the machine; twice as many each time that it was calibrated again.
@@ -91,7 +90,7 @@ def ways(candidates: Mapping[str, Candidate], threads: int, points: int) -> Gene
     """
     if _file is not None:
         known = _known.setdefault(threads, _Known())
-        for size in (_SMALL, _LARGE) if points >= _DENSE else (_SMALL,):
+        for size in (_SMALL, _LARGE) if points >= DENSE else (_SMALL,):
             if size not in known.calibrated:
                 found = yield from scaled(_measured(candidates, threads, size), 0, 0)
                 for name, factor in found.items():
@@ -139,6 +138,7 @@ def _measured(candidates: Mapping[str, Candidate], threads: int, size: int) -> G
         for seed in range(_LOOKS):
             pilots.append((yield from look(mesh, scene, _ORDER, _TOLERANCE, seed, pool, threads)))
     pilot = sorted(pilots, key=lambda each: each.ray)[_LOOKS // 2]
+    pilot = yield from tried(mesh, scene, _ORDER, pilot, _TOLERANCE, 0, threads)
     known = factors(threads)
     wanted = {name: plans[0] for name, candidate in candidates.items() if candidate.traces and candidate.ways
               and name not in known and (plans := candidate.ways(pilot, size, _TOLERANCE, ""))}

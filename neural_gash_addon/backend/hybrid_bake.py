@@ -6,6 +6,7 @@ import time
 from collections.abc import Generator, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +16,11 @@ from . import spherical_harmonics as sh
 from .estimator import MAX_RAYS, RATE, BlockedEstimator, morton_order
 from .geometry import TriangleMesh
 from .hybrid import SIZE, between, evenness, filtered, placed, second_curve
-from .pilot import Pilot, dark, noise_beside, pilot_rays, relative, sample_size
+from .pilot import Near, Pilot, dark, pilot_rays, sample_size
 from .progress import run, scaled
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
+from .shares import error_at, nearest
 from .transfer import Transfer
 from .weights import load_hybrid
 from .workers import default_threads, workers
@@ -31,6 +33,11 @@ _LADDER = sorted([2, 3, *(n << k for k in range(10) for n in (4, 5, 6)), MAX_RAY
 # the noise, and the more normals turn from one to the next, the less neighbours save; and of more points, more.
 # (Least squares of logarithms, 204 bakes of 60 meshes of meshes/train: the rays wanted are told to 30 %.)
 _BESIDE, _VARIES, _TURNS, _MANY = 0.67, 0.29, 0.46, 0.06
+# On dense meshes what neighbours save is tried: with each of some of the pilot's points the ones beside it, two blocks
+# of both passes; with so much of the rays that the law above expects. The bake's own error is so much of that, as most
+# of its blocks are not cut off. (24 meshes of meshes/train, subdivided to 70,000 to 180,000 points: the rays wanted are
+# told to 28 %, by the law, which is 1.5 times too high there, to 50 %.)
+_TRIED, _TRIED_RAYS, _INSIDE = 2 * SIZE, 0.25, 0.9
 _FALLS = 0.55         # the error falls as rays**-_FALLS, for saying how many rays more are wanted
 _MOST_STEP = 2.0      # from a number of rays to the next
 _MARGIN = 0.97        # of the tolerance at which it stops: of several measures the first that is too low is met
@@ -70,7 +77,9 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     if tolerance is not None:
         tolerance *= _MARGIN
     lit = mesh.lit()
-    curve = _Curve(mesh, lit) if len(lit) >= FEWEST else None
+    curve = Curve(mesh, lit) if len(lit) >= FEWEST else None
+    if pilot is not None and pilot.near is not None:
+        curve = pilot.near.curve
 
     def plainly(spent: int = 0) -> Generator[float, None, Transfer]:
         more = None if rays is None else max(rays, min(2 * rays, MOST_DOUBLED))
@@ -111,12 +120,59 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
 
 def expected_rays(pilot: Pilot, points: int, tolerance: float) -> int:
     """Rays with which a bake of so many points is expected to meet a tolerance."""
+    near = pilot.near
+    if near is not None and (error := _error_near(pilot, near)) is not None:
+        return _on_ladder(near.rays * (_INSIDE * error / tolerance) ** (1 / _FALLS))
     saved = _BESIDE * pilot.turns ** _TURNS * points ** -_MANY
     plain = pilot.needed_rays(tolerance)  # the noise with these is the tolerance
     # saved * (varies / noise) ** _VARIES * noise = tolerance, if that is less than the noise
     beside = saved * (pilot.varies / tolerance) ** _VARIES
     fewer = min(beside, 1.0) ** (2 / RATE / (1 - _VARIES))
     return _on_ladder(plain * fewer)
+
+
+def _error_near(pilot: Pilot, near: Near) -> float | None:
+    """Of the bake that was tried; None where it cannot be told."""
+    one, two = (trace[near.points] for trace in pilot.sample[1:])
+    moved = near.taken - near.traced
+    _, others = nearest(near.traced, moved, one, two)
+    return error_at(near.traced + others * moved, near.traced, near.rays, one, two, pilot.rays,
+                    pilot.unshadowed[near.points])
+
+
+def tried(mesh: TriangleMesh, scene: Occluders, order: int, pilot: Pilot, tolerance: float, seed: int, pool: Executor,
+          threads: int) -> Generator[float, None, Pilot]:
+    """Try what neighbours save on a dense mesh, of which a pilot's points, far apart, say little: around some of them.
+
+    Those and the ones beside them along the curve are baked, with fewer rays than the tolerance will want.
+
+    Returns:
+        The pilot, with that in it where the network would be asked at all.
+    """
+    lit = mesh.lit()
+    curve = Curve(mesh, lit)
+    if evenness(curve.normals) < _LEAST_EVEN:
+        return pilot
+    some = pilot.some(len(lit))
+    at = curve.place(len(mesh.points))[pilot.sample[0][some]]
+    first = np.clip(at - _TRIED // 2, 0, len(lit) - _TRIED)
+    along = (first[:, None] + np.arange(_TRIED)).ravel()
+    rows, every = curve.lit[along], np.arange(len(along))
+    few = replace(mesh, points=mesh.points[rows], normals=mesh.normals[rows], clearance=mesh.clearance[rows])
+    rays = _on_ladder(max(_TRIED_RAYS * expected_rays(pilot, len(lit), tolerance), FIRST_RAYS))
+    estimator = BlockedEstimator(few, scene, order, int(np.random.default_rng([seed, 6]).integers(2**31)), rays)
+    sums = np.zeros((len(rows), sh.coefficient_count(order)))
+    curved = pool.submit(lambda: curve.second)  # beside the rest, which waits for rays
+    yield from estimator.trace(pool, threads, every, 0, rays, sums)
+    traced = estimator.blocked(pool, every, sums, rays)
+    rank = np.empty(len(lit), np.int64)
+    rank[curved.result()] = np.arange(len(lit))
+    second = np.argsort(rank[along].reshape(-1, _TRIED), 1) + np.arange(0, len(along), _TRIED)[:, None]
+    taken = filtered(curve.places[along], curve.normals[along], (None, second.ravel()), traced,
+                     sh.cosine_lobe(few.normals, order).astype(np.float32), rays, load_hybrid(), pool)
+    here = np.arange(0, len(along), _TRIED) + at - first
+    return replace(pilot, near=Near(rays, some, traced[here], taken[here], curve),
+                   traced=pilot.traced + rays * len(rows))
 
 
 def _more(rays: int, error: float | None, tolerance: float | None) -> int:
@@ -140,12 +196,12 @@ def at_once(mesh: TriangleMesh, occluders: Sequence[Geometry], order: int, rays:
     lit = mesh.lit()
     if len(lit):
         with workers(threads, len(lit) * (rays + _PASSES)) as pool:
-            work = _Work(mesh, scene, order, seed, rays, _Curve(mesh, lit), pool, threads)
+            work = _Work(mesh, scene, order, seed, rays, Curve(mesh, lit), pool, threads)
             coefficients[work.lit] = work.unshadowed - run(work.trace(0, rays))[1]
     return coefficients
 
 
-class _Curve:
+class Curve:
     """The n points (at least one) that have a normal, along the first curve."""
 
     def __init__(self, mesh: TriangleMesh, lit: NDArray) -> None:
@@ -155,18 +211,29 @@ class _Curve:
         self.places = places[order]    # (n, 3) as `filtered` wants them,
         self.normals = normals[order]  # (n, 3) likewise
 
+    @cached_property
+    def second(self) -> NDArray[np.int64]:
+        """(n,) the second curve, of places along the first."""
+        return second_curve(self.places)
+
+    def place(self, points: int) -> NDArray[np.int64]:
+        """Where along the curve each of the mesh's points is; anything, of those that have no normal."""
+        out = np.zeros(points, np.int64)
+        out[self.lit] = np.arange(len(self.lit))
+        return out
+
 
 class _Work:
     """The arrays of one bake, of the n points that have a normal, along the first curve."""
 
-    def __init__(self, mesh: TriangleMesh, scene: Occluders, order: int, seed: int, rays: int, curve: _Curve,
+    def __init__(self, mesh: TriangleMesh, scene: Occluders, order: int, seed: int, rays: int, curve: Curve,
                  pool: Executor, threads: int, tolerance: float | None = None, sample_rays: int | None = None,
                  samples: bool = False) -> None:
         """rays: the most. sample_rays: of a pilot's points. samples: whether `sample` is wanted."""
         self._order, self._seed, self._curve, self._points = order, seed, curve, len(mesh.points)
         self._pool, self._threads, self._network = pool, threads, load_hybrid()
         self.lit, count = curve.lit, len(curve.lit)
-        self._second = pool.submit(second_curve, curve.places)  # beside the rest, which waits for rays
+        self._second = pool.submit(lambda: curve.second)  # beside the rest, which waits for rays
         self.unshadowed = np.empty((count, sh.coefficient_count(order)), np.float32)  # (n, K), `filled`
 
         def fill(start: int) -> None:
@@ -217,31 +284,19 @@ class _Work:
 
     def along(self, points: NDArray, one: NDArray, two: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """What `sample` gives, of points of the mesh that were traced before."""
-        place = np.zeros(self._points, np.int64)
-        place[self.lit] = np.arange(len(self.lit))
-        return place[points], one, two
+        return self._curve.place(self._points)[points], one, two
 
     def blended(self, traced: NDArray, taken: NDArray, points: NDArray, one: NDArray, two: NDArray
                 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """traced + share * (taken - traced), with the share of each band that is nearest the truth.
-
-        The sample says so: its two traces are independent of both, so the sum of (traced + share d - one) (traced +
-        share d - two) over it is the squared error and a constant, and is least where its derivative vanishes. So a
-        network that errs on a mesh, or where rays are many, is not followed.
+        """traced + share * (taken - traced), with the share of each band that is nearest the truth (`shares`).
 
         Returns:
-            (n, K) of all points; and (s, K) of the sample, each with the shares that all others say are nearest: what
-            a share was chosen by would seem nearer than it is.
+            (n, K) of all points; and (s, K) of the sample, each with the shares that all others say are nearest.
         """
         moved = taken - traced
         here, was = moved[points], traced[points]
-        starts = np.square(np.arange(self._order))
-        slope = np.add.reduceat(here * (one + two - 2 * was), starts, 1)  # (s, bands)
-        curvature = np.add.reduceat(2 * np.square(here, dtype=np.float64), starts, 1)
-        widths = 2 * np.arange(self._order) + 1
-        all_slope, all_curvature = slope.sum(0), curvature.sum(0)
-        others = np.repeat(_share(all_slope - slope, all_curvature - curvature), widths, 1)
-        moved *= np.repeat(_share(all_slope, all_curvature), widths).astype(np.float32)
+        every, others = nearest(was, here, one, two)
+        moved *= every.astype(np.float32)
         moved += traced
         return moved, was + others * here
 
@@ -252,26 +307,5 @@ class _Work:
 
     def error(self, blocked: NDArray, traced: NDArray[np.float32], rays: int, points: NDArray, one: NDArray,
               two: NDArray) -> float | None:
-        """Relative L2 error at the sample, where `blocked` (s, K) is the answer and `traced` (n, K) had so many rays.
-
-        Both traces' noise is independent, so it cancels in the product. Where the sample has less rays than the bake,
-        though, what is left of it is most of the measure. The same measure of what was traced has the same noise, and
-        its truth is known otherwise: by how the two differ. So that is a control variate. An error that is too small to
-        be told from the standard error of its square is said to be as large as that.
-        """
-        here = ((blocked - one) * (blocked - two)).sum(1)
-        open_sky = self.unshadowed[points]
-        squared, least = float(here.sum()), float(np.square(here).sum()) ** 0.5
-        if rays > self._sample_rays:
-            was = ((traced[points] - one) * (traced[points] - two)).sum(1)
-            apart, off = was - was.mean(), here - here.mean()
-            noise = float(np.square(one - two).sum()) / 2 * noise_beside(self._sample_rays, rays) ** 2
-            share = float(np.clip(apart @ off / max(apart @ apart, 1e-300), 0, 1))
-            squared -= share * (float(was.sum()) - noise)
-            least = float(np.square(off - share * apart).sum()) ** 0.5
-        return relative(max(squared, least), ((open_sky - one) * (open_sky - two)).sum(1), open_sky)
-
-
-def _share(slope: NDArray, curvature: NDArray) -> NDArray:
-    """Of the network's answer: all of it where that moves nothing."""
-    return np.clip(np.divide(slope, curvature, out=np.ones_like(slope), where=curvature > 1e-12), 0, 1)
+        """Relative L2 error at the sample, where `blocked` (s, K) is the answer, and `traced` (n, K) had `rays`."""
+        return error_at(blocked, traced[points], rays, one, two, self._sample_rays, self.unshadowed[points])

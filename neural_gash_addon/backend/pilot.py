@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Generator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ from .workers import spread
 
 POINTS = 256                  # or a 16th of them all, if that is less; or a 256th, if that is more
 _FEWEST, _MOST = 128, 2048
+DENSE = 1 << 16               # points from which on bakes are tried at some of them: one
+_MOST_TRIED, _APART = 256, 1024  # of so many
 _NOISE, _NOISE_RAYS = 0.035, 64  # the noise of so many rays is no more on most meshes
 _LEAST_RAYS, _MOST_RAYS = 8, 256
 _SETS = 8
@@ -33,6 +36,26 @@ DARK = 1e-3                  # of the transfer in the open: less than this is as
 _FEEBLE = 2.0                 # of light: sizes of points' energies beside their sum, from which on that is mostly noise
 _UNSEEN = 0.05                # of the noise: what differs less is not seen
 _SURE = 1.3                   # standard errors of a share that are added to it, to be above it in nine cases of ten
+
+
+@dataclass(frozen=True, eq=False)
+class Near:
+    """A hybrid bake, tried at m of a pilot's points and those beside them."""
+
+    rays: int
+    points: NDArray   # (m,) which of the sample
+    traced: NDArray   # (m, K) what is blocked, by so many rays,
+    taken: NDArray    # and as the network has it
+    curve: Any        # `hybrid_bake.Curve`, of all points
+
+
+@dataclass(frozen=True, eq=False)
+class Apart:
+    """A sparse bake, tried at m of a pilot's points."""
+
+    points: NDArray   # (m,) which of the sample
+    read: NDArray     # (m, K) what is blocked, read off samples some points apart
+    curve: NDArray    # `sparse_bake.curve`, of all points: which of the mesh's they are
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +74,24 @@ class Pilot:
     turns: float      # their normals, likewise
     unshadowed: NDArray = field(default_factory=lambda: np.zeros((0, 0)))  # (n, K), of these points
     threads: int = 1  # that a bake has
+    near: Near | None = None    # where points are many: what bakes for such meshes
+    apart: Apart | None = None  # have shown
 
     def to_order(self, order: int) -> Pilot:
         """What it would be, had it been traced at a lower order."""
         points, one, two = self.sample
         terms = sh.coefficient_count(order)
-        return _said((points, one[:, :terms], two[:, :terms]), self.turns, self.unshadowed[:, :terms], self.rays,
+        said = _said((points, one[:, :terms], two[:, :terms]), self.turns, self.unshadowed[:, :terms], self.rays,
                      self.ray, self.traced, self.threads)
+        near, apart = self.near, self.apart
+        return replace(
+            said, near=near and replace(near, traced=near.traced[:, :terms], taken=near.taken[:, :terms]),
+            apart=apart and replace(apart, read=apart.read[:, :terms]))
+
+    def some(self, points: int) -> NDArray[np.int64]:
+        """Which of the sample (m,) a bake of so many points, dense as they are, is tried at: spread over all of it."""
+        count = min(len(self.sample[0]), _MOST_TRIED, points // _APART)
+        return np.linspace(0, len(self.sample[0]) - 1, count).astype(np.int64)
 
     def beyond(self, order: int) -> tuple[float, float]:
         """What the bands from `order` on are of |T|, and a bound as of `most_blocked`; infinite in the dark."""

@@ -18,22 +18,24 @@ from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from functools import cache
 
-from . import bands
+import numpy as np
+
+from . import bands, hybrid_bake, sparse_bake
 from .bands import Bands
 from .embree_bake import FIRST_RAYS
-from .hybrid_bake import FEWEST, expected_rays
-from .pilot import Pilot
+from .geometry import TriangleMesh
+from .pilot import DENSE, Pilot
+from .raycast import Occluders
 from .transfer import Transfer
+from .workers import workers
 
 _SAFE = 1.06                 # what the pilot's noise may be too low by
 _FEW_RAYS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # of plain bakes; with more, not to take all alike saves more
 _EMBREE_SECONDS, _HYBRID_SECONDS = 5e-4, 7e-4  # what a bake costs at all,
 _PLAIN_RAYS, _EMBREE_RAYS, _HYBRID_RAYS = 3.0, 11.0, 8.0  # and at each point besides its rays, in rays
 _EMBREE_MORE = 1.07  # the rays of one to a tolerance beside those that are needed if all take as many
-SPARSE_POINTS = 1 << 16      # from which on a sparse bake is a candidate; below, too many are samples
 _SPARSE_MARGIN = 0.95        # of a tolerance: what it measures is a little too low where it stops
-_SPARSE_SHARE = 0.16         # of the points that it then traces, about
-_SPARSE_RAYS = 28.0          # what reconstruction costs at each point, in rays
+_SPARSE_RAYS = 7.0           # what reconstruction costs at each point, in rays
 _GNN_RAYS, _EMBEDDING_RAYS = 110.0, 130.0  # what networks cost at each point, in rays,
 _EMBEDDING_SECONDS = 0.3     # and for its scene points;
 _GNN_LEFT, _EMBEDDING_LEFT = 0.4, 0.4  # their error as a part of shadows: the root of an SRR that few meshes exceed
@@ -62,6 +64,19 @@ class Candidate:
     bake: Callable[..., Generator[float, None, Transfer]]
     traces: bool          # takes rays or a tolerance, the scene and the pilot, and measures its error
     ways: Way | None      # None: where nothing is traced
+
+
+def tried(mesh: TriangleMesh, scene: Occluders, order: int, found: Pilot, tolerance: float, seed: int, threads: int
+          ) -> Generator[float, None, Pilot]:
+    """What a pilot saw, and, if the mesh is dense, what is shown by bakes that are tried at some of its points."""
+    points = len(mesh.lit())
+    if not found.scale or points < DENSE:
+        return found
+    with workers(threads) as pool:  # the hybrid, which costs more to be tried, only where it may be the cheaper one
+        found = yield from sparse_bake.tried(mesh, scene, order, found, tolerance, seed, pool, threads)
+        if sparse_bake.expected_rays(found, points, tolerance) + _SPARSE_RAYS > _HYBRID_RAYS + 2:
+            found = yield from hybrid_bake.tried(mesh, scene, order, found, tolerance, seed, pool, threads)
+    return found
 
 
 def unshadowed_bands(found: Pilot, order: int, tolerance: float) -> tuple[Plan, Bands] | None:
@@ -131,18 +146,20 @@ def embree_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[
 
 def hybrid_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[Plan]:
     """Few rays; of few points it asks no network, and what it does without takes longer than plain rays."""
-    rays = expected_rays(found, points, tolerance) + _HYBRID_RAYS
-    return [] if points < FEWEST else [Plan(
+    rays = hybrid_bake.expected_rays(found, points, tolerance) + _HYBRID_RAYS
+    return [] if points < hybrid_bake.FEWEST else [Plan(
         "hybrid", tolerance=tolerance, seconds=_HYBRID_SECONDS + found.seconds(points, rays),
         reason=f"Few rays, averaged over neighbours by the network, are the quickest way to {said}.")]
 
 
 def sparse_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[Plan]:
-    """Some of many points."""
+    """Some of many points, if that was tried."""
+    if found.apart is None:
+        return []
     measured = _SPARSE_MARGIN * tolerance
-    seconds = found.seconds(points, _SPARSE_RAYS + _SPARSE_SHARE * max(found.needed_rays(measured), 8.0))
-    return [] if points < SPARSE_POINTS else [Plan(
-        "sparse", tolerance=measured, seconds=seconds,
+    rays = sparse_bake.expected_rays(found, points, measured) + _SPARSE_RAYS
+    return [] if not np.isfinite(rays) else [Plan(
+        "sparse", tolerance=measured, seconds=found.seconds(points, rays),
         reason=f"{points:,} points are dense: some are traced, and the others read off them.")]
 
 

@@ -184,16 +184,16 @@ def test_without_a_file_nothing_is_calibrated_nor_learned(clock):
     assert machine.runs == {"slow": 0} and factors(["slow"]) == [1]
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"version": 3}', '{"version": 3, "machines": 5}',
-                                     '{"version": 3, "machines": {"here": 5}}',
-                                     '{"version": 3, "machines": {"here": {"1": {"factors": {"slow": 0}}}}}',
-                                     '{"version": 3, "machines": {"here": {"1": {"calibrated": null}}}}',
-                                     '{"version": 3, "machines": {"here": {"1": {"off": Infinity}}}}',
-                                     '{"version": 3, "machines": {"here": {"1": {"off": "0"}}}}',
-                                     '{"version": 3, "machines": {"here": {"1": {"again": -1}}}}',
-                                     '{"version": 3, "machines": {"here": {"1": {"again": 4000000000}}}}',
-                                     '{"version": 3, "machines": {"here": {"one": {}}}}', "[" * 200_000,
-                                     '{"version": 3, "machines": {"here": {"1": {"factors": {"slow": "2"}}}}}'])
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"version": 4}', '{"version": 4, "machines": 5}',
+                                     '{"version": 4, "machines": {"here": 5}}',
+                                     '{"version": 4, "machines": {"here": {"1": {"factors": {"slow": 0}}}}}',
+                                     '{"version": 4, "machines": {"here": {"1": {"calibrated": null}}}}',
+                                     '{"version": 4, "machines": {"here": {"1": {"off": Infinity}}}}',
+                                     '{"version": 4, "machines": {"here": {"1": {"off": "0"}}}}',
+                                     '{"version": 4, "machines": {"here": {"1": {"again": -1}}}}',
+                                     '{"version": 4, "machines": {"here": {"1": {"again": 4000000000}}}}',
+                                     '{"version": 4, "machines": {"here": {"one": {}}}}', "[" * 200_000,
+                                     '{"version": 4, "machines": {"here": {"1": {"factors": {"slow": "2"}}}}}'])
 def test_a_damaged_file_is_replaced(file, clock, caplog, monkeypatch, content):
     monkeypatch.setattr(costs, "_machine", lambda: "here")
     file.parent.mkdir()

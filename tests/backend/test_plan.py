@@ -82,11 +82,6 @@ def test_looser_tolerances_never_cost_more_and_the_cheapest_is_taken():
             before = chosen.seconds
 
 
-def test_dense_meshes_are_planned_sparse_where_many_rays_are_wanted():
-    found = seen(0.3, 0.03)
-    assert [plan.cheapest(found, points, 0.02, WAYS).method for points in (20_000, 1_000_000)] == ["hybrid", "sparse"]
-
-
 def test_every_method_of_the_table_that_says_what_it_could_do_is_a_candidate(monkeypatch):
     """One that is added, too; where its answer is not within the tolerance, which the pilot tells, rays are traced."""
     mesh = TriangleMesh.from_triangles(*torus(sections=64))
