@@ -28,12 +28,12 @@ from .raycast import Occluders
 from .workers import workers
 
 VERSION = 4          # raised whenever the constants of `plan` are others, or what is measured
-_SMALL, _LARGE = 1 << 13, 1 << 17  # points that are baked; so many for methods that are for dense meshes alone
-_TOLERANCE, _ORDER = 0.1, 3
-_LOOKS, _RUNS = 9, 5  # of a pilot, whose median counts; and of a method, the least: other work makes it only longer
-# Over what is expected, on this mesh, where the constants of `plan` are from, with one thread. (A smooth mesh: from
-# few of its points the others can be read.)
-_THERE = {"embree": 1.02, "hybrid": 1.02, "sparse": 0.72}
+_SMALL, _LARGE = 1 << 13, 80_000  # points that are baked: so many before the first mesh that is dense
+_TOLERANCES, _ORDER = (0.1, 0.2), 3  # of either
+_LOOKS, _RUNS = 9, (5, 3)  # of a pilot, whose median counts; of a method, the least: other work makes it only longer
+_ALIKE = ("embree",)  # on dense meshes, where it would take longest to be measured, as on others
+# Over what is expected, on these meshes, where the constants of `plan` are from, with one thread.
+_THERE = {"embree": 1.02, "hybrid": 1.02}, {"hybrid": 0.98, "sparse": 0.78}
 _USUAL = 0.95        # of what `plan` says bakes take, in the median of many meshes
 # A bake that takes so many times what is expected, or less than the reciprocal, is off, mostly by its mesh. So many in
 # a row, all too long or all too short, are by the machine; twice as many each time that it was calibrated again.
@@ -48,14 +48,15 @@ class _Known:
     """Of this machine, with some number of threads."""
 
     calibrated: list[int] = field(default_factory=list)  # sizes
-    factors: dict[str, float] = field(default_factory=dict)  # of methods
+    factors: dict[str, float] = field(default_factory=dict)  # of methods,
+    dense: dict[str, float] = field(default_factory=dict)    # and on dense meshes, where threads have more work
     off: int = 0      # bakes in a row that took too long; below 0: that took too short
     again: int = 0    # times that it was calibrated anew
 
     def __post_init__(self) -> None:
         if not (isinstance(self.calibrated, list) and type(self.off) is type(self.again) is int
                 and 0 <= self.again <= _MOST_AGAIN
-                and all(1 / _MOST <= factor <= _MOST for factor in self.factors.values())):
+                and all(1 / _MOST <= factor <= _MOST for of in (self.factors, self.dense) for factor in of.values())):
             raise ValueError("numbers out of range")
 
 
@@ -75,9 +76,13 @@ def keep_in(file: Path | None) -> None:
         _known.clear()
 
 
-def factors(threads: int) -> dict[str, float]:
-    """What is known of this machine with so many threads: what methods take over what is expected; of others, 1."""
-    return dict(_known[threads].factors) if threads in _known else {}
+def factors(threads: int, points: int = 0) -> dict[str, float]:
+    """What is known of this machine with so many threads: what methods take over what is expected; of others, 1.
+
+    points: of a mesh.
+    """
+    known = _known.get(threads, _Known())
+    return {**known.factors, **(known.dense if points >= DENSE else {})}
 
 
 def ways(candidates: Mapping[str, Candidate], threads: int, points: int) -> Generator[float, None, dict[str, Way]]:
@@ -93,11 +98,11 @@ def ways(candidates: Mapping[str, Candidate], threads: int, points: int) -> Gene
         for size in (_SMALL, _LARGE) if points >= DENSE else (_SMALL,):
             if size not in known.calibrated:
                 found = yield from scaled(_measured(candidates, threads, size), 0, 0)
-                for name, factor in found.items():
-                    known.factors.setdefault(name, min(max(factor, 1 / _MOST), _MOST))
+                of = known.dense if size == _LARGE else known.factors
+                of.update({name: min(max(factor, 1 / _MOST), _MOST) for name, factor in found.items()})
                 known.calibrated.append(size)
                 _write()
-    here = factors(threads)
+    here = factors(threads, points)
     return {name: _here(each.ways, _USUAL * here.get(name, 1.0)) for name, each in candidates.items() if each.ways}
 
 
@@ -114,7 +119,7 @@ def learn(plan: Plan, threads: int, taken: float) -> None:
     All methods anew, and not the factor of that which was off: a busy machine is slower in all, and choices hang on how
     they compare.
     """
-    if plan.method not in factors(threads) or not plan.seconds or max(plan.seconds, taken) < _LONG:
+    if plan.method not in factors(threads, DENSE) or not plan.seconds or max(plan.seconds, taken) < _LONG:
         return
     known, ratio = _known[threads], taken / plan.seconds
     side = (ratio > _WRONG) - (ratio < 1 / _WRONG)
@@ -128,26 +133,26 @@ def learn(plan: Plan, threads: int, taken: float) -> None:
 def _measured(candidates: Mapping[str, Candidate], threads: int, size: int) -> Generator[float, None, dict[str, float]]:
     """What methods that are ways to bake a mesh of so many points take, over what is expected; the least of some runs.
 
-    In turns, so that what else goes on meets all of them. Of larger meshes only what no smaller one has.
+    In turns, so that what else goes on meets all of them.
     """
-    mesh = _bumpy(size)
+    dense, mesh = size == _LARGE, _bumpy(size)
+    tolerance = _TOLERANCES[dense]
     scene = Occluders([(mesh.positions, mesh.triangles)], mesh.resolution)
     found: dict[str, float] = {}
-    with workers(threads, looking(size, _TOLERANCE)) as pool:
+    with workers(threads, looking(size, tolerance)) as pool:
         pilots: list[Pilot] = []
         for seed in range(_LOOKS):
-            pilots.append((yield from look(mesh, scene, _ORDER, _TOLERANCE, seed, pool, threads)))
+            pilots.append((yield from look(mesh, scene, _ORDER, tolerance, seed, pool, threads)))
     pilot = sorted(pilots, key=lambda each: each.ray)[_LOOKS // 2]
-    pilot = yield from tried(mesh, scene, _ORDER, pilot, _TOLERANCE, 0, threads)
-    known = factors(threads)
+    pilot = yield from tried(mesh, scene, _ORDER, pilot, tolerance, 0, threads)
     wanted = {name: plans[0] for name, candidate in candidates.items() if candidate.traces and candidate.ways
-              and name not in known and (plans := candidate.ways(pilot, size, _TOLERANCE, ""))}
-    for seed in range(_RUNS):
+              and not (dense and name in _ALIKE) and (plans := candidate.ways(pilot, size, tolerance, ""))}
+    for seed in range(_RUNS[dense]):
         for name, plan in wanted.items():
             _, taken = yield from clocked(candidates[name].bake(
                 mesh, _ORDER, rays=plan.rays, tolerance=plan.tolerance, occluders=(), seed=seed, threads=threads,
                 scene=scene, pilot=pilot))
-            factor = taken / plan.seconds / _THERE.get(name, 1.0)
+            factor = taken / plan.seconds / _THERE[dense].get(name, 1.0)
             found[name] = min(factor, found.get(name, factor))
     return found
 

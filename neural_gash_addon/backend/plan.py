@@ -34,8 +34,7 @@ _FEW_RAYS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # of plain bakes; with m
 _EMBREE_SECONDS, _HYBRID_SECONDS = 5e-4, 7e-4  # what a bake costs at all,
 _PLAIN_RAYS, _EMBREE_RAYS, _HYBRID_RAYS = 3.0, 11.0, 8.0  # and at each point besides its rays, in rays
 _EMBREE_MORE = 1.07  # the rays of one to a tolerance beside those that are needed if all take as many
-_SPARSE_MARGIN = 0.95        # of a tolerance: what it measures is a little too low where it stops
-_SPARSE_RAYS = 7.0           # what reconstruction costs at each point, in rays
+_SPARSE_RAYS = 4.0           # what reconstruction costs at each point, in rays
 _GNN_RAYS, _EMBEDDING_RAYS = 110.0, 130.0  # what networks cost at each point, in rays,
 _EMBEDDING_SECONDS = 0.3     # and for its scene points;
 _GNN_LEFT, _EMBEDDING_LEFT = 0.4, 0.4  # their error as a part of shadows: the root of an SRR that few meshes exceed
@@ -156,10 +155,9 @@ def sparse_ways(found: Pilot, points: int, tolerance: float, said: str) -> list[
     """Some of many points, if that was tried."""
     if found.apart is None:
         return []
-    measured = _SPARSE_MARGIN * tolerance
-    rays = sparse_bake.expected_rays(found, points, measured) + _SPARSE_RAYS
+    rays = sparse_bake.expected_rays(found, points, tolerance) + _SPARSE_RAYS
     return [] if not np.isfinite(rays) else [Plan(
-        "sparse", tolerance=measured, seconds=found.seconds(points, rays),
+        "sparse", tolerance=tolerance, seconds=found.seconds(points, rays),
         reason=f"{points:,} points are dense: some are traced, and the others read off them.")]
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,11 +42,14 @@ _LEAST_RAYS = 8
 _WORTH = 0.5           # of the rays that a bake of every point takes: where more are still wanted, that is done instead
 _POWER = 3.0           # of an error: how the samples that it takes grow (2.4 to 3.6 on dense meshes)
 _TRIED = 8             # points from one sample to the next of a bake that is tried,
-# the share that it traces of all points where it just meets the tolerance, and how that grows with the error (25 meshes
-# of meshes/train, subdivided to 70,000 to 420,000 points; the share is told to a factor of 2)
-_NEEDED, _GROW = 0.13, 4.0
-_HOPELESS = 0.4        # share from which on it is expected to give up
+# The share that it traces of all points where it just stops there, and how that grows with the error (25 meshes of
+# meshes/train, subdivided to 70,000 to 420,000 points; the share is told to a factor of 2).
+_NEEDED, _GROW = 0.12, 4.0
+_HOPELESS = 0.25       # share from which on it is expected to give up
+_MARGIN = 0.9          # of the tolerance at which it stops: of several measures the first that is too low is met
+_LEAST_FALL = 0.02     # of an error as the samples double: with less it falls no more
 _COVERED = 0.8         # of what the gaps' ends differ, closed in a round
+_LEAST = 1e-18         # mean D: of points that are one
 _TURN = 0.2            # of the extent: how far away a neighbour counts that faces a right angle away
 SOFT = 0.05            # of the mean D of a window: what a sample's weight is bounded by
 _HEIGHT = 8.0          # how much more a distance counts across the surface than along it, squared
@@ -72,7 +75,8 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
         lit = lit[curve(mesh.points[lit], mesh.normals[lit])] if pilot is None or not pilot.apart else pilot.apart.curve
         with workers(threads) as pool:
             work = _Work(mesh, scene, order, seed, lit, pool, threads)
-            error = yield from scaled(work.refine(rays, tolerance, pilot), 0, 0.8)
+            goal = None if tolerance is None else _MARGIN * tolerance
+            error = yield from scaled(work.refine(rays, goal, pilot), 0, 0.8)
             traced = len(work.samples) * work.rays
             if error is not None:
                 yield from scaled(work.fill(coefficients), 0.8, 0.2)
@@ -113,12 +117,13 @@ def tried(mesh: TriangleMesh, scene: Occluders, order: int, pilot: Pilot, tolera
     at = np.clip(first, 0, len(lit) - WINDOW * _TRIED)[:, None] + np.arange(0, WINDOW * _TRIED, _TRIED)
     rows, every = lit[at.ravel()], np.arange(at.size)
     few = replace(mesh, points=mesh.points[rows], normals=mesh.normals[rows], clearance=mesh.clearance[rows])
-    rays = _rays(pilot.noise_of(_HELD_RAYS), tolerance)
+    rays = _rays(pilot.noise_of(_HELD_RAYS), _MARGIN * tolerance)
     estimator = BlockedEstimator(few, scene, order, int(rng.integers(2**31)), rays)
     sums = np.zeros((len(rows), sh.coefficient_count(order)))
     yield from estimator.trace(pool, threads, every, 0, rays, sums)
     values = levelled(estimator.blocked(pool, every, sums, rays), sh.cosine_lobe(few.normals, order), -1)
-    read = _read(mesh.points, mesh.normals, lit[at], values.reshape(*at.shape, -1), lit[wanted], 1.0 / scene.scale)
+    samples, here = Samples.at(scene.normalise(few.points), few.normals, values), lit[wanted]
+    read = samples.read(every.reshape(at.shape).T, scene.normalise(mesh.points[here]), mesh.normals[here])
     return replace(pilot, apart=Apart(some, levelled(read, pilot.unshadowed[some], 1), lit),
                    traced=pilot.traced + rays * len(rows))
 
@@ -131,8 +136,9 @@ def expected_rays(pilot: Pilot, points: int, tolerance: float) -> float:
     error = error_at(read, read, 0, one, two, pilot.rays, pilot.unshadowed[some])
     if error is None:
         return np.inf
-    share = max(_NEEDED * (error / tolerance) ** _GROW, 1 / FIRST_STRIDE, FEWEST / points)
-    return share * _rays(pilot.noise_of(_HELD_RAYS), tolerance) if share < _HOPELESS else np.inf
+    goal = _MARGIN * tolerance
+    share = max(_NEEDED * (error / goal) ** _GROW, 1 / FIRST_STRIDE, FEWEST / points)
+    return share * _rays(pilot.noise_of(_HELD_RAYS), goal) if share < _HOPELESS else np.inf
 
 
 def _rays(noise: float, tolerance: float) -> int:
@@ -148,37 +154,63 @@ def curve(points: NDArray, normals: NDArray) -> NDArray[np.int64]:
     return order[np.argsort(octant[order], kind="stable")]
 
 
-def reconstructed(points: NDArray, normals: NDArray, samples: NDArray, values: NDArray, wanted: NDArray, extent: float
-                  ) -> NDArray[np.float32]:
-    """Values (n, K) of some points, each the mean of those of the WINDOW samples nearest to it along the curve.
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Some of the points, in the scene's coordinates (`Occluders.normalise`), and values at them.
 
-    A sample weighs 1 / (D + SOFT mean D)**2, where D = distance**2 + HEIGHT height**2 + (TURN extent)**2 (1 - cosine of
-    the normals). So a sample, too, takes something of others: that is less noise.
-
-    Args:
-        points, normals: (N, 3), in the order of the curve. samples: (M,) indices of some, rising.
-        values: (M, K) at them. wanted: (n,) indices.
-        extent: of what is baked, metres.
+    Points are along the last axis, as NumPy is quick along long ones.
     """
+
+    places: NDArray[np.float32]  # (3, M)
+    facing: NDArray[np.float32]  # (3, M) normals
+    values: NDArray[np.float32]  # (K, M)
+
+    @classmethod
+    def at(cls, places: NDArray, normals: NDArray, values: NDArray) -> Samples:
+        """Of rows (M, 3), (M, 3) and (M, K)."""
+        return cls(*(np.ascontiguousarray(rows.T, np.float32) for rows in (places, normals, values)))
+
+    def read(self, which: NDArray[np.int64], places: NDArray, normals: NDArray) -> NDArray[np.float32]:
+        """Values (n, K) at other points (n, 3) with normals (n, 3), each the mean of those of some samples (w, n).
+
+        A sample weighs 1 / (D + SOFT mean D)**2, where D = distance**2 + HEIGHT height**2 + TURN**2 (1 - cosine of the
+        normals). So a sample, too, takes something of others: that is less noise.
+        """
+        here, normal = (np.ascontiguousarray(rows.T, np.float32) for rows in (places, normals))
+        squares = np.empty(which.shape, np.float32)
+        for square, chosen in zip(squares, which, strict=True):
+            away = self.places.take(chosen, 1)
+            away -= here
+            np.square(_dot(away, normal), out=square)
+            square *= np.float32(_HEIGHT)
+            square += _dot(away, away)
+            turn = np.subtract(1, _dot(self.facing.take(chosen, 1), normal))
+            square += np.float32(_TURN ** 2) * np.maximum(turn, 0, out=turn)
+        squares /= np.maximum(squares.mean(0), np.float32(_LEAST))
+        squares += np.float32(SOFT)
+        weights = 1 / np.square(squares, out=squares)
+        weights /= weights.sum(0)
+        out = np.zeros((len(self.values), which.shape[1]), np.float32)
+        for weight, chosen in zip(weights, which, strict=True):
+            part = self.values.take(chosen, 1)
+            part *= weight
+            out += part
+        return out.T
+
+
+def _dot(one: NDArray, two: NDArray) -> NDArray:
+    """Of vectors (3, n)."""
+    out = one[0] * two[0]
+    for a, b in zip(one[1:], two[1:], strict=True):
+        out += a * b
+    return out
+
+
+def beside(samples: NDArray, wanted: NDArray) -> NDArray[np.int64]:
+    """The WINDOW samples (M,), rising along a curve, that are nearest to other points (n,): rows of these (w, n)."""
     width = min(WINDOW, len(samples))
     first = np.clip(np.searchsorted(samples, wanted) - width // 2, 0, len(samples) - width)
-    chosen = first[:, None] + np.arange(width)
-    at = samples[chosen]
-    return _read(points, normals, at, values[chosen], wanted, extent)
-
-
-def _read(points: NDArray, normals: NDArray, at: NDArray, values: NDArray, wanted: NDArray, extent: float
-          ) -> NDArray[np.float32]:
-    """As `reconstructed`, of the samples (n, w) at which `values` (n, w, K) are."""
-    away = points[at] - points[wanted, None]
-    normal = normals[wanted]
-    square = np.einsum("nwx,nwx->nw", away, away)
-    square += _HEIGHT * np.square(np.einsum("nwx,nx->nw", away, normal))
-    square += (_TURN * extent) ** 2 * np.maximum(1 - np.einsum("nwx,nx->nw", normals[at], normal), 0)
-    square /= np.maximum(square.mean(1, keepdims=True), (1e-9 * extent) ** 2 + 1e-300)  # no overflow
-    weight = 1 / np.square(square + SOFT)
-    weight /= weight.sum(1, keepdims=True)
-    return np.matmul(weight[:, None].astype(np.float32), values)[:, 0]
+    return first + np.arange(width)[:, None]
 
 
 class _Work:
@@ -187,12 +219,12 @@ class _Work:
     def __init__(self, mesh: TriangleMesh, scene: Occluders, order: int, seed: int, lit: NDArray,
                  pool: Executor, threads: int) -> None:
         self._scene, self._order, self._pool, self._threads = scene, order, pool, threads
-        self._mesh = replace(mesh, points=mesh.points[lit], normals=mesh.normals[lit], clearance=mesh.clearance[lit])
+        self._mesh = mesh
         self._lit = lit
-        self._extent = 1.0 / scene.scale
         self._rng = np.random.default_rng([seed, 4])
         self.samples = np.zeros(0, np.int64)
         self._values = np.zeros((0, sh.coefficient_count(order)), np.float32)  # blocked part, see `levelled`
+        self._sampled = Samples.at(*self._there(self.samples), self._values)
         self.rays, self.probes = 0, 0
 
     def refine(self, rays: int | None, tolerance: float | None, pilot: Pilot | None
@@ -203,8 +235,11 @@ class _Work:
         wanted, mostly after the first.
         """
         count = len(self._lit)
+        known = None
         if pilot is not None and np.isfinite(pilot.noise):
-            noise = pilot.noise_of(_HELD_RAYS)
+            noise, place = pilot.noise_of(_HELD_RAYS), np.zeros(len(self._mesh.points), np.int64)
+            place[self._lit] = np.arange(count)
+            known = place[pilot.sample[0]], *pilot.sample[1:]
         else:
             held = yield from self._held(np.arange(count))
             noise = self._noise(*held)  # of _HELD_RAYS, relative
@@ -219,22 +254,36 @@ class _Work:
         every = count * (self.rays if rays is not None else _HELD_RAYS * (noise / goal) ** (2 / RATE))
         stride = max(1, min(FIRST_STRIDE, count // FEWEST))
         fresh = np.unique(np.append(np.arange(0, count, stride), count - 1))
-        left, before = 1.0, 0.0
+        left = 1.0
+        before: list[tuple[int, float]] = []  # samples, and the error with them
         while True:
             yield from scaled(self._sample(fresh), 1 - left, left / 2)
             left /= 2
-            apart = np.ones(count, bool)
-            apart[self.samples] = False
-            held = yield from scaled(self._held(np.flatnonzero(apart)), 1 - left, 0)
-            error = self._error(*held)
+            if known is None:
+                apart = np.ones(count, bool)
+                apart[self.samples] = False
+                held = yield from scaled(self._held(np.flatnonzero(apart)), 1 - left, 0)
+            error = self._error(*(known or held))
             if error is None or error <= goal:
                 return error
-            fresh = self._to_close()
-            likely = (error * (before or error)) ** 0.5  # a single measure of few points errs much
-            wanted = max(len(fresh), len(self.samples) * ((likely / goal) ** _POWER - 1))
-            if self.rays * wanted > _WORTH * max(every, count):
+            before.append((len(self.samples), error))
+            if self.rays * self._wanted(before, goal, known is not None) > _WORTH * max(every, count):
                 return None
-            before = error
+            fresh = self._to_close()
+
+    def _wanted(self, before: Sequence[tuple[int, float]], goal: float, same: bool) -> float:
+        """How many more samples, by how many there were in each round and the errors with them; infinite where all are.
+
+        same: whether all errors are of the same points, so that what they fell by is no accident.
+        """
+        count, error = before[-1]
+        power, half = _POWER, [each for each in before if 2 * each[0] <= count]
+        if not same:
+            error = (error * before[max(len(before) - 2, 0)][1]) ** 0.5  # a single measure of few points errs much
+        elif half:
+            fell = np.log(half[-1][1] / error) / np.log(count / half[-1][0])
+            power = max(power, 1 / max(float(fell), _LEAST_FALL))
+        return count * max((error / goal) ** power - 1, 1 / 8) if count < len(self._lit) else np.inf
 
     def fill(self, coefficients: NDArray[np.float32]) -> Generator[float, None, None]:
         """Transfer (N, K) of all points that have a normal."""
@@ -242,7 +291,7 @@ class _Work:
 
         def part(start: int) -> None:
             rows = np.arange(start, min(start + _ROWS, count))
-            unshadowed = sh.cosine_lobe(self._mesh.normals[rows], self._order).astype(np.float32)
+            unshadowed = self._unshadowed(rows).astype(np.float32)
             blocked = self._at(rows, unshadowed)
             coefficients[self._lit[rows]] = unshadowed - blocked
 
@@ -252,16 +301,25 @@ class _Work:
 
     def _at(self, rows: NDArray, unshadowed: NDArray) -> NDArray[np.float32]:
         """Blocked part (n, K) at some points, reconstructed."""
-        values = reconstructed(self._mesh.points, self._mesh.normals, self.samples, self._values, rows, self._extent)
-        return levelled(values, unshadowed, 1)
+        return levelled(self._sampled.read(beside(self.samples, rows), *self._there(rows)), unshadowed, 1)
+
+    def _there(self, rows: NDArray) -> tuple[NDArray[np.float32], NDArray]:
+        """Some points (n, 3), in the scene's coordinates, and their normals."""
+        chosen = self._lit[rows]
+        return self._scene.normalise(self._mesh.points[chosen]), self._mesh.normals[chosen]
+
+    def _unshadowed(self, rows: NDArray) -> NDArray[np.float64]:
+        """Transfer (n, K) of some points, were nothing blocked."""
+        return sh.cosine_lobe(self._mesh.normals[self._lit[rows]], self._order)
 
     def _sample(self, fresh: NDArray) -> Generator[float, None, None]:
         """Trace some points and add them to the samples."""
         blocked = yield from self._traced(fresh, self.rays)
-        values = levelled(blocked.astype(np.float32), sh.cosine_lobe(self._mesh.normals[fresh], self._order), -1)
+        values = levelled(blocked.astype(np.float32), self._unshadowed(fresh), -1)
         samples = np.concatenate([self.samples, fresh])
         order = np.argsort(samples, kind="stable")
         self.samples, self._values = samples[order], np.concatenate([self._values, values])[order]
+        self._sampled = Samples.at(*self._there(self.samples), self._values)
 
     def _to_close(self) -> NDArray[np.int64]:
         """The middles of the gaps between samples whose ends differ most, times the points between."""
@@ -288,7 +346,7 @@ class _Work:
         Both traces' noise is independent, so it cancels in the product. An error that is too small to be told from the
         standard error of its square is said to be as large as that.
         """
-        unshadowed = sh.cosine_lobe(self._mesh.normals[points], self._order)
+        unshadowed = self._unshadowed(points)
         blocked = self._at(points, unshadowed)
         squares = ((blocked - one) * (blocked - two)).sum(1)
         least = float(np.square(squares).sum()) ** 0.5
@@ -296,14 +354,14 @@ class _Work:
 
     def _noise(self, points: NDArray, one: NDArray, two: NDArray) -> float:
         """Relative error of one of two traces, from how they differ; 0 in the dark."""
-        unshadowed = sh.cosine_lobe(self._mesh.normals[points], self._order)
+        unshadowed = self._unshadowed(points)
         energy = float(((unshadowed - one) * (unshadowed - two)).sum())
         return 0.0 if dark(energy, unshadowed) else (float(np.square(one - two).sum()) / 2 / energy) ** 0.5
 
     def _traced(self, points: NDArray, rays: int) -> Generator[float, None, NDArray]:
         """The blocked part (n, K) at some points, with rays of their own."""
-        few = replace(self._mesh, points=self._mesh.points[points], normals=self._mesh.normals[points],
-                      clearance=self._mesh.clearance[points])
+        chosen, mesh = self._lit[points], self._mesh
+        few = replace(mesh, points=mesh.points[chosen], normals=mesh.normals[chosen], clearance=mesh.clearance[chosen])
         estimator = BlockedEstimator(few, self._scene, self._order, int(self._rng.integers(2**31)), rays)
         rows = np.arange(len(points))
         sums = np.zeros((len(points), sh.coefficient_count(self._order)))

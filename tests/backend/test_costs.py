@@ -9,7 +9,7 @@ import pytest
 
 from neural_gash_addon.backend import costs, methods, metrics, pilot, plan, progress
 from neural_gash_addon.backend.geometry import TriangleMesh
-from neural_gash_addon.backend.pilot import Pilot
+from neural_gash_addon.backend.pilot import DENSE, Pilot
 from neural_gash_addon.backend.raycast import Occluders
 from neural_gash_addon.backend.workers import spread, workers
 
@@ -66,9 +66,9 @@ def file(tmp_path, monkeypatch):
     costs.keep_in(None)
 
 
-def factors(names, threads=1):
+def factors(names, threads=1, points=0):
     """What is known of some methods."""
-    return [costs.factors(threads).get(name, 1.0) for name in names]
+    return [costs.factors(threads, points).get(name, 1.0) for name in names]
 
 
 def calibrated(candidates, threads=1, points=1000):
@@ -78,7 +78,7 @@ def calibrated(candidates, threads=1, points=1000):
 def test_a_machine_is_calibrated_once_and_it_is_kept(file, clock):
     machine = Machine(clock, slow=2.5, quick=0.5)
     calibrated(machine.candidates())
-    assert machine.runs == {"slow": costs._RUNS, "quick": costs._RUNS}
+    assert machine.runs == {"slow": costs._RUNS[0], "quick": costs._RUNS[0]}
     assert factors(["slow", "quick", "other"]) == pytest.approx([2.5, 0.5, 1])
     ways = calibrated(machine.candidates())
     told = [way(None, 1000, 0.1, "") for way in ways.values()]
@@ -87,7 +87,7 @@ def test_a_machine_is_calibrated_once_and_it_is_kept(file, clock):
     costs.keep_in(file)  # as when Blender starts again
     assert factors(["slow", "quick"]) == pytest.approx([2.5, 0.5])
     calibrated(machine.candidates())
-    assert machine.runs == {"slow": costs._RUNS, "quick": costs._RUNS}
+    assert machine.runs == {"slow": costs._RUNS[0], "quick": costs._RUNS[0]}
 
 
 def test_another_number_of_threads_and_another_machine_are_calibrated_by_themselves(file, clock, monkeypatch):
@@ -107,18 +107,23 @@ def test_another_number_of_threads_and_another_machine_are_calibrated_by_themsel
     assert factors(["slow"]) + factors(["slow"], threads=2) == pytest.approx([2.5, 4])
 
 
-def test_methods_for_dense_meshes_are_calibrated_before_the_first_of_these(file, clock):
+def test_dense_meshes_have_factors_of_their_own_before_the_first_of_these(file, clock):
     machine = Machine(clock, slow=2.5, dense=0.5)
     calibrated(machine.candidates(["dense"]))
-    assert machine.runs == {"slow": costs._RUNS, "dense": 0}
+    assert machine.runs == {"slow": costs._RUNS[0], "dense": 0}
+    machine.slower["slow"] = 1.5
     for _ in range(2):
-        calibrated(machine.candidates(["dense"]), points=1 << 16)
-    assert machine.runs == {"slow": costs._RUNS, "dense": costs._RUNS}
-    assert factors(["slow", "dense"]) == pytest.approx([2.5, 0.5])
+        ways = calibrated(machine.candidates(["dense"]), points=DENSE)
+    assert machine.runs == {"slow": sum(costs._RUNS), "dense": costs._RUNS[1]}
+    assert factors(["slow", "dense"]) == pytest.approx([2.5, 1])
+    assert factors(["slow", "dense"], points=DENSE) == pytest.approx([1.5, 0.5])
+    assert ways["slow"](None, DENSE, 0.1, "")[0].seconds == pytest.approx(costs._USUAL * 0.3 * 1.5)
+    costs.keep_in(file)
+    assert factors(["slow", "dense"], points=DENSE) == pytest.approx([1.5, 0.5])
 
 
 def test_what_a_method_takes_where_its_constants_are_from_is_no_news(file, clock, monkeypatch):
-    monkeypatch.setitem(costs._THERE, "slow", 1.25)
+    monkeypatch.setitem(costs._THERE[0], "slow", 1.25)
     calibrated(Machine(clock, slow=2.5).candidates())
     assert factors(["slow"]) == pytest.approx([2])
 
@@ -155,15 +160,15 @@ def test_where_it_proves_wrong_the_machine_is_calibrated_again(file, clock):
     assert factors(["slow", "quick"]) == [1, 1]
     calibrated(machine.candidates())
     assert factors(["slow", "quick"]) == pytest.approx([5, 0.75])
-    assert machine.runs == {"slow": 2 * costs._RUNS, "quick": 2 * costs._RUNS}
+    assert machine.runs == {"slow": 2 * costs._RUNS[0], "quick": 2 * costs._RUNS[0]}
     for _ in range(9):
         told(0.1)
         calibrated(machine.candidates())
-    assert machine.runs == {"slow": 2 * costs._RUNS, "quick": 2 * costs._RUNS}
+    assert machine.runs == {"slow": 2 * costs._RUNS[0], "quick": 2 * costs._RUNS[0]}
     told(0.1)
     costs.keep_in(file)
     calibrated(machine.candidates())
-    assert machine.runs == {"slow": 3 * costs._RUNS, "quick": 3 * costs._RUNS}
+    assert machine.runs == {"slow": 3 * costs._RUNS[0], "quick": 3 * costs._RUNS[0]}
 
 
 def test_what_is_too_short_or_not_expected_or_of_other_threads_says_nothing(file, clock):
