@@ -24,7 +24,6 @@ from textures import surface_of
 
 from neural_gash_addon.backend import methods, texture
 from neural_gash_addon.backend import spherical_harmonics as sh
-from neural_gash_addon.backend.advice import missed
 from neural_gash_addon.backend.atlas import Part, place
 from neural_gash_addon.backend.raster import Coverage
 from neural_gash_addon.backend.raycast import Occluders
@@ -63,7 +62,7 @@ def main() -> int:
             times.append(time.process_time())
             seen = bake.record.between_error
             values = np.einsum("nc,nck->nk", weights, bake.coefficients[mesh.triangles[faces]].astype(float))
-            finer, target = seen is not None and missed(seen, tolerance), "vertices"
+            finer, target = bool(bake.record.between_missed), "vertices"
             if finer:
                 target = "texture"
             if finer and not arguments.looks:
