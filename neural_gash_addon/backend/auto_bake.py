@@ -72,8 +72,8 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
             error = pilot.error_of(transfer.coefficients)
             missed = error is None or error > left
         if missed:
-            ways = yield from scaled(costs.ways(candidates, count, len(mesh.points)), _PILOT_SHARE, 0)
-            plan = cheapest(pilot, len(mesh.points), left, ways.values(), tolerance, measuring=True)
+            ways = yield from scaled(costs.ways(candidates, count, len(mesh.lit())), _PILOT_SHARE, 0)
+            plan = cheapest(pilot, len(mesh.lit()), left, ways.values(), tolerance, measuring=True)
             transfer = yield from scaled(work(plan), _PILOT_SHARE, 1 - _PILOT_SHARE)
             error = transfer.record.error_estimate
     record = replace(transfer.record, plan=plan.reason).also(found.bands.reason).also(advice.domain(mesh))

@@ -4,7 +4,7 @@
 A pilot says what a ray costs here and now. What a method costs besides is in `plan`, in rays and seconds of the machine
 that they were found on, for meshes as they mostly are. Where another's processor, or the number of its threads, makes
 that more or less, a method takes a multiple of what is expected: so many times what it takes on that machine, with one
-mesh. These factors are kept in a file, if there is one (`keep_in`); without, all are 1.
+mesh, or one that is dense. These factors are kept in a file, if there is one (`keep_in`); without, all are 1.
 """
 from __future__ import annotations
 

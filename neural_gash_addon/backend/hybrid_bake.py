@@ -77,9 +77,10 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
     if tolerance is not None:
         tolerance *= _MARGIN
     lit = mesh.lit()
-    curve = Curve(mesh, lit) if len(lit) >= FEWEST else None
     if pilot is not None and pilot.near is not None:
         curve = pilot.near.curve
+    else:
+        curve = Curve(mesh, lit) if len(lit) >= FEWEST else None
 
     def plainly(spent: int = 0) -> Generator[float, None, Transfer]:
         more = None if rays is None else max(rays, min(2 * rays, MOST_DOUBLED))

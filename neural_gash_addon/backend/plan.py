@@ -6,7 +6,8 @@
 2. Else a pilot says how large shadows are, and what rays bring and cost (`pilot`).
 3. Bands whose energy would not be seen are dropped (`bands`); the rest of the tolerance is for the others.
 4. Each candidate is given a number of rays that meets the tolerance, and a time; the cheapest is taken. What the noise
-   becomes with other rays, and what a hybrid or a sparse bake saves, follow laws measured on meshes (below).
+   becomes with other rays, and what a hybrid bake saves, follow laws measured on meshes (below); on dense meshes hybrid
+   and sparse bakes are tried at some of the pilot's points.
 
 `gnn` and `embedding` are candidates that hardly ever win: what the former saves is the scene, which the
 pilot has built, and at each point it costs as much as 100 rays, which are more exact; the latter costs more than that.

@@ -3,8 +3,9 @@
 
 On a dense scan the blocked part varies slowly from vertex to vertex. Points are put in an order in which neighbours are
 near and face alike (octant of the normal, then a Z-order curve). Every so many of them are traced, then the middle of
-each gap whose ends differ most, until the error is within the tolerance. That error is measured in each round at fresh
-points that were held back, traced twice with rays of their own, so it has everything in it: noise and reconstruction.
+each gap whose ends differ most, until the error is within the tolerance. That error is measured in each round at a
+pilot's points, or fresh ones that were held back, traced twice with rays of their own, so it has everything in it:
+noise and reconstruction.
 What is not blocked is exact everywhere, as in the other methods. Where points are too few for all this, every point is
 traced, as by `embree`; or few rays from every point, as by `hybrid`, where a pilot says that this costs far less.
 """
@@ -35,7 +36,7 @@ WINDOW = 8             # samples along the curve that a point is read off
 FIRST_STRIDE = 64      # points from one sample to the next at the beginning, or fewer where points are few
 FEWEST = 4096          # samples at the beginning
 _LEAST_STRIDE = 4      # with less than so many points for each of them, every point is traced
-HELD = 512             # points held back, in each round
+HELD = 512             # points held back in each round, without a pilot
 _HELD_RAYS = 64        # of each of their two traces
 _NOISE = 1.2           # times the tolerance: a sample's own noise, of which the mean over several leaves less than half
 _LEAST_RAYS = 8
@@ -46,7 +47,10 @@ _TRIED = 8             # points from one sample to the next of a bake that is tr
 # meshes/train, subdivided to 70,000 to 420,000 points; the share is told to a factor of 2).
 _NEEDED, _GROW = 0.12, 4.0
 _HOPELESS = 0.25       # share from which on it is expected to give up
-_MARGIN = 0.9          # of the tolerance at which it stops: of several measures the first that is too low is met
+# Of the tolerance, at which it stops, as of several measures the first that is too low is met; and at which it is
+# content where more samples would cost as much as all points.
+_MARGIN, _BARELY = 0.9, 0.95
+_LOG_MOST = 60.0       # of a logarithm: more samples than there can be points
 _LEAST_FALL = 0.03     # of an error as the samples double: with less it falls no more
 _COVERED = 0.8         # of what the gaps' ends differ, closed in a round
 _LEAST = 1e-18         # mean D: of points that are one
@@ -75,8 +79,7 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
         lit = lit[curve(mesh.points[lit], mesh.normals[lit])] if pilot is None or not pilot.apart else pilot.apart.curve
         with workers(threads) as pool:
             work = _Work(mesh, scene, order, seed, lit, pool, threads)
-            goal = None if tolerance is None else _MARGIN * tolerance
-            error = yield from scaled(work.refine(rays, goal, pilot), 0, 0.8)
+            error = yield from scaled(work.refine(rays, tolerance, pilot), 0, 0.8)
             traced = len(work.samples) * work.rays
             if error is not None:
                 yield from scaled(work.fill(coefficients), 0.8, 0.2)
@@ -86,11 +89,13 @@ def bake(mesh: TriangleMesh, order: int, *, rays: int | None, tolerance: float |
                     tolerance=tolerance))
         spent = traced + work.probes
     plainly: Callable[..., Generator[float, None, Transfer]] = embree_bake.bake
-    if pilot is not None and tolerance is not None:
+    if pilot is not None and tolerance is not None and pilot.scale:
         if pilot.near is None and len(lit) >= DENSE:
+            before = pilot.traced
             with workers(threads) as pool:
                 trying = hybrid_bake.tried(mesh, scene, order, pilot, tolerance, seed, pool, threads)
                 pilot = yield from scaled(trying, 0.8, 0)
+            spent += pilot.traced - before
         # half: what the network costs besides
         if hybrid_bake.expected_rays(pilot, len(lit), tolerance) < pilot.needed_rays(tolerance) / 2:
             plainly = hybrid_bake.bake
@@ -184,8 +189,9 @@ class Samples:
             np.square(_dot(away, normal), out=square)
             square *= np.float32(_HEIGHT)
             square += _dot(away, away)
-            turn = np.subtract(1, _dot(self.facing.take(chosen, 1), normal))
-            square += np.float32(_TURN ** 2) * np.maximum(turn, 0, out=turn)
+            turned = self.facing.take(chosen, 1)
+            turned -= normal
+            square += np.float32(_TURN ** 2 / 2) * _dot(turned, turned)  # 1 - cosine, exact where that is 0
         squares /= np.maximum(squares.mean(0), np.float32(_LEAST))
         squares += np.float32(SOFT)
         weights = 1 / np.square(squares, out=squares)
@@ -229,10 +235,10 @@ class _Work:
 
     def refine(self, rays: int | None, tolerance: float | None, pilot: Pilot | None
                ) -> Generator[float, None, float | None]:
-        """Add samples until the measured error is within the tolerance; that error.
+        """Add samples until the measured error is well within the tolerance; that error.
 
         None where every point had better be traced: that is known as soon as the error says how many samples are
-        wanted, mostly after the first.
+        wanted, mostly after the first. If the tolerance is met by then, if barely, it is enough.
         """
         count = len(self._lit)
         known = None
@@ -247,11 +253,11 @@ class _Work:
             self.rays = rays
         else:
             assert tolerance is not None
-            self.rays = _rays(noise, tolerance)
-        goal = noise * (_HELD_RAYS / self.rays) ** (RATE / 2) if tolerance is None else tolerance
+            self.rays = _rays(noise, _MARGIN * tolerance)
+        goal = noise * (_HELD_RAYS / self.rays) ** (RATE / 2) if tolerance is None else _MARGIN * tolerance
         if not goal:
             return None
-        every = count * (self.rays if rays is not None else _HELD_RAYS * (noise / goal) ** (2 / RATE))
+        plain = self.rays if rays is not None else max(_HELD_RAYS * (noise / goal) ** (2 / RATE), _LEAST_RAYS)
         stride = max(1, min(FIRST_STRIDE, count // FEWEST))
         fresh = np.unique(np.append(np.arange(0, count, stride), count - 1))
         left = 1.0
@@ -267,9 +273,10 @@ class _Work:
             if error is None or error <= goal:
                 return error
             before.append((len(self.samples), error))
-            if self.rays * self._wanted(before, goal, known is not None) > _WORTH * max(every, count):
-                return None
             fresh = self._to_close()
+            wanted = max(self._wanted(before, goal, known is not None), len(fresh))
+            if self.rays * wanted > _WORTH * plain * count:
+                return error if tolerance is not None and error <= _BARELY * tolerance else None
 
     def _wanted(self, before: Sequence[tuple[int, float]], goal: float, same: bool) -> float:
         """How many more samples, by how many there were in each round and the errors with them; infinite where all are.
@@ -283,7 +290,9 @@ class _Work:
         elif half:
             fell = np.log(half[-1][1] / error) / np.log(count / half[-1][0])
             power = max(power, 1 / max(float(fell), _LEAST_FALL))
-        return count * max((error / goal) ** power - 1, 1 / 8) if count < len(self._lit) else np.inf
+        if count == len(self._lit):
+            return np.inf
+        return count * float(np.expm1(min(power * np.log(error / goal), _LOG_MOST)))
 
     def fill(self, coefficients: NDArray[np.float32]) -> Generator[float, None, None]:
         """Transfer (N, K) of all points that have a normal."""
@@ -325,6 +334,8 @@ class _Work:
         """The middles of the gaps between samples whose ends differ most, times the points between."""
         length = np.diff(self.samples)
         gap = np.flatnonzero(length > 1)
+        if not len(gap):
+            return gap
         differ = np.square(self._values[gap + 1] - self._values[gap]).sum(1, dtype=np.float64) * (length[gap] - 1)
         rank = np.argsort(-differ, kind="stable")
         total = np.cumsum(differ[rank])
@@ -341,7 +352,7 @@ class _Work:
         return points, one, two
 
     def _error(self, points: NDArray, one: NDArray, two: NDArray) -> float | None:
-        """Relative L2 error at points held back; None in the dark, or where it can hardly be told from that.
+        """Relative L2 error at points that were traced twice; None in the dark, or where it can hardly be told.
 
         Both traces' noise is independent, so it cancels in the product. An error that is too small to be told from the
         standard error of its square is said to be as large as that.

@@ -238,6 +238,15 @@ def test_the_methods_of_the_table_are_calibrated_by_the_first_plan(file):
     assert metrics.rel_l2(found.coefficients, reference) <= 0.0625
 
 
+def test_dense_meshes_are_calibrated_by_the_methods_of_the_table(file, monkeypatch):
+    """Sparse is expected to take something there, or it would keep a factor of 1 beside others that are measured."""
+    monkeypatch.setattr(costs, "_LARGE", 67_000)
+    methods.run(costs.ways(methods.candidates(), 1, DENSE))
+    known = json.loads(file.read_text())["machines"][costs._machine()]["1"]
+    traced = {name for name, entry in methods.METHODS.items() if entry.traces and entry.ways}
+    assert set(known["dense"]) == traced - set(costs._ALIKE) and set(costs._ALIKE) < traced
+
+
 def test_plans_follow_what_is_known_of_the_machine(file):
     """The dearest method is not taken, whichever it is."""
     mesh = TriangleMesh.from_triangles(*torus(sections=120))

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The sparse bake: reconstruction against a plain twin, the error it reports, and what it saves."""
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -87,12 +88,38 @@ def test_what_a_plan_gives_up_is_baked_the_cheaper_way(dense, monkeypatch):
     found = methods.run(sparse_bake.bake(dense, 3, pilot=seen, **known))
     assert found.record.method == "sparse" and found.record.rays < plainly.record.rays / 2
     np.testing.assert_array_equal(found.coefficients, few.coefficients)
-    found = methods.run(sparse_bake.bake(dense, 3, pilot=replace(seen, near=None), **known))
-    np.testing.assert_array_equal(found.coefficients, few.coefficients)
+    tried = methods.run(sparse_bake.bake(dense, 3, pilot=replace(seen, near=None), **known))
+    np.testing.assert_array_equal(tried.coefficients, few.coefficients)
+    points = len(dense.points)
+    assert tried.record.probe_rays == found.record.probe_rays + seen.near.rays * 64 * (points // 1024)
     smooth_nowhere = replace(seen, near=replace(seen.near, taken=seen.near.traced))
     for pilot in (smooth_nowhere, None):
         found = methods.run(sparse_bake.bake(dense, 3, pilot=pilot, **known))
         assert found.record.rays >= 0.9 * plainly.record.rays
+
+
+def test_where_more_samples_do_not_help_it_gives_up(dense, monkeypatch):
+    """As where what is left is the noise of few rays: not a round more than tells that, nor an error where all are."""
+    scene = Occluders([(dense.positions, dense.triangles)])
+    with workers(1) as pool:
+        seen = methods.run(look(dense, scene, 3, 0.05, 0, pool, 1))
+    counts = []
+
+    def error(self, *_):
+        counts.append(len(self.samples))
+        return 0.048
+
+    monkeypatch.setattr(sparse_bake._Work, "_error", error)
+    known = {"rays": None, "tolerance": 0.05, "occluders": (), "seed": 0, "threads": 1, "scene": scene}
+    found = methods.run(sparse_bake.bake(dense, 3, pilot=seen, **known))
+    assert 1 < len(counts) < 8 and counts[-1] < len(dense.points) / 2
+    assert found.record.rays > 2 * len(dense.points)  # of every point
+    for samples, before in ((50_000, [(20_000, 0.5), (50_000, 0.4)]), (20, [(5, 1.0), (10, 0.9), (20, 1e6)])):
+        work = SimpleNamespace(_lit=np.arange(60_000), samples=np.arange(samples))
+        assert np.isfinite(sparse_bake._Work._wanted(work, before, 1e-4, True))
+    work = SimpleNamespace(_lit=np.arange(9), samples=np.arange(9), _values=np.zeros((9, 4), np.float32))
+    assert sparse_bake._Work._wanted(work, [(9, 0.5)], 0.1, True) == np.inf
+    assert not len(sparse_bake._Work._to_close(work))
 
 
 def test_points_few_enough_are_all_traced():
