@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Generator, Iterator
 from concurrent.futures import Executor
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -235,6 +236,26 @@ class BlockedEstimator:
 def _upright_lobe(order: int) -> NDArray[np.float64]:
     """(K,) unshadowed transfer in every local frame."""
     return sh.cosine_lobe(np.array([[0.0, 0.0, 1.0]]), order)[0]
+
+
+def blocked_at(mesh: TriangleMesh, rows: NDArray, occluders: Occluders, order: int, seed: int, rays: int,
+               pool: Executor, threads: int) -> Generator[float, None, NDArray[np.float32]]:
+    """The blocked part (n, K) in the bake frame of some of a mesh's points (n,), each with so many rays.
+
+    rows: in an order that is coherent in space. Yields progress, as `BlockedEstimator.trace`.
+    """
+    few = replace(mesh, points=mesh.points[rows], normals=mesh.normals[rows], clearance=mesh.clearance[rows])
+    estimator, every = BlockedEstimator(few, occluders, order, seed, rays), np.arange(len(rows))
+    sums = np.zeros((len(rows), sh.coefficient_count(order)))
+    yield from estimator.trace(pool, threads, every, 0, rays, sums)
+    return estimator.blocked(pool, every, sums, rays)
+
+
+def places_along(curve: NDArray, points: int) -> NDArray[np.int64]:
+    """Where along a curve (n,) of some of so many points each of them lies (points,); 0 of those that it leaves out."""
+    out = np.zeros(points, np.int64)
+    out[curve] = np.arange(len(curve))
+    return out
 
 
 def morton_order(points: NDArray) -> NDArray[np.int64]:

@@ -221,7 +221,7 @@ def mixed(places: NDArray[np.float32], normals: NDArray[np.float32], values: NDA
     bands = sh.order_of(terms)
     mean = np.full(points, 1 / points, np.float32)  # of a block, as a product
     away = places - (places @ mean)[..., None]
-    squares = _dot(away, away)
+    squares = dot(away, away)
     size = np.sqrt(squares @ mean) + np.float32(1e-9)
     away /= size[:, None]
     squares /= np.square(size)[:, None]
@@ -232,7 +232,7 @@ def mixed(places: NDArray[np.float32], normals: NDArray[np.float32], values: NDA
     seen[0] *= np.sqrt(first)
     seen[1:] *= np.sqrt(second)
     alone = distance * squares
-    alone += _dot(seen, seen)
+    alone += dot(seen, seen)
     one, other = np.empty((2, 12, count, points), np.float32)
     np.multiply(away, 2 * distance, out=one[:3])
     np.multiply(normals, facing, out=one[3:6])
@@ -244,7 +244,7 @@ def mixed(places: NDArray[np.float32], normals: NDArray[np.float32], values: NDA
     weight = other.transpose(1, 2, 0) @ one.transpose(1, 0, 2)  # (b, other, one)
     # how far the other lies off one's tangent plane
     np.multiply(normals, np.sqrt(plane), out=one[:3])
-    np.negative(_dot(one[:3], away), out=one[3])
+    np.negative(dot(one[:3], away), out=one[3])
     other[3] = 1
     height = other[:4].transpose(1, 2, 0) @ one[:4].transpose(1, 0, 2)
     weight -= np.square(height, out=height)
@@ -257,7 +257,7 @@ def mixed(places: NDArray[np.float32], normals: NDArray[np.float32], values: NDA
     return out
 
 
-def _dot(one: NDArray[np.float32], two: NDArray[np.float32]) -> NDArray[np.float32]:
+def dot(one: NDArray[np.float32], two: NDArray[np.float32]) -> NDArray[np.float32]:
     """Of vectors (k, ...)."""
     out = one[0] * two[0]
     for a, b in zip(one[1:], two[1:], strict=True):

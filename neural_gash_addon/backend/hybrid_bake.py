@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from . import embree_bake
 from . import spherical_harmonics as sh
-from .estimator import MAX_RAYS, RATE, BlockedEstimator, morton_order
+from .estimator import MAX_RAYS, RATE, BlockedEstimator, blocked_at, morton_order, places_along
 from .geometry import TriangleMesh
 from .hybrid import SIZE, between, evenness, filtered, placed, second_curve
 from .pilot import Near, Pilot, dark, pilot_rays, sample_size
@@ -158,19 +158,15 @@ def tried(mesh: TriangleMesh, scene: Occluders, order: int, pilot: Pilot, tolera
     at = curve.place(len(mesh.points))[pilot.sample[0][some]]
     first = np.clip(at - _TRIED // 2, 0, len(lit) - _TRIED)
     along = (first[:, None] + np.arange(_TRIED)).ravel()
-    rows, every = curve.lit[along], np.arange(len(along))
-    few = replace(mesh, points=mesh.points[rows], normals=mesh.normals[rows], clearance=mesh.clearance[rows])
+    rows = curve.lit[along]
     rays = _on_ladder(max(_TRIED_RAYS * expected_rays(pilot, len(lit), tolerance), FIRST_RAYS))
-    estimator = BlockedEstimator(few, scene, order, int(np.random.default_rng([seed, 6]).integers(2**31)), rays)
-    sums = np.zeros((len(rows), sh.coefficient_count(order)))
+    own = int(np.random.default_rng([seed, 6]).integers(2**31))
     curved = pool.submit(lambda: curve.second)  # beside the rest, which waits for rays
-    yield from estimator.trace(pool, threads, every, 0, rays, sums)
-    traced = estimator.blocked(pool, every, sums, rays)
-    rank = np.empty(len(lit), np.int64)
-    rank[curved.result()] = np.arange(len(lit))
+    traced = yield from blocked_at(mesh, rows, scene, order, own, rays, pool, threads)
+    rank = places_along(curved.result(), len(lit))
     second = np.argsort(rank[along].reshape(-1, _TRIED), 1) + np.arange(0, len(along), _TRIED)[:, None]
     taken = filtered(curve.places[along], curve.normals[along], (None, second.ravel()), traced,
-                     sh.cosine_lobe(few.normals, order).astype(np.float32), rays, load_hybrid(), pool)
+                     sh.cosine_lobe(mesh.normals[rows], order).astype(np.float32), rays, load_hybrid(), pool)
     here = np.arange(0, len(along), _TRIED) + at - first
     return replace(pilot, near=Near(rays, some, traced[here], taken[here], curve),
                    traced=pilot.traced + rays * len(rows))
@@ -219,9 +215,7 @@ class Curve:
 
     def place(self, points: int) -> NDArray[np.int64]:
         """Where along the curve each of the mesh's points is; anything, of those that have no normal."""
-        out = np.zeros(points, np.int64)
-        out[self.lit] = np.arange(len(self.lit))
-        return out
+        return places_along(self.lit, points)
 
 
 class _Work:

@@ -119,10 +119,7 @@ class Pilot:
         is left of it (the standard error of its square) is said to be as large as that.
         """
         points, one, two = self.sample
-        blocked = self.unshadowed - coefficients[points]
-        squares = ((blocked - one) * (blocked - two)).sum(1)
-        least = float(np.square(squares).sum()) ** 0.5
-        return relative(max(float(squares.sum()), least), self._energies()[0].sum(1), self.unshadowed)
+        return error_by_twins(self.unshadowed - coefficients[points], one, two, self.unshadowed)
 
     def seconds(self, points: int, rays: float) -> float:
         """Of so many rays, or what takes as long, from each of some points."""
@@ -194,6 +191,19 @@ def relative(squared: float, lights: NDArray, unshadowed: NDArray) -> float | No
     if dark(energy, unshadowed) or float(np.abs(lights).sum()) > _FEEBLE * energy:
         return None
     return (max(squared, 0.0) / energy) ** 0.5
+
+
+def error_by_twins(blocked: NDArray, one: NDArray, two: NDArray, open_sky: NDArray) -> float | None:
+    """The relative L2 error of an answer at points, by two traces of their own; None as of `relative`.
+
+    Both traces' noise is independent, so it cancels in the product. An error that is too small to be told from the
+    standard error of its square is said to be as large as that.
+
+    blocked: (n, K), the answer's blocked part. one, two: (n, K). open_sky: (n, K) unshadowed transfer.
+    """
+    squares = ((blocked - one) * (blocked - two)).sum(1)
+    least = float(np.square(squares).sum()) ** 0.5
+    return relative(max(float(squares.sum()), least), ((open_sky - one) * (open_sky - two)).sum(1), open_sky)
 
 
 def noise_beside(rays: float, others: float) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import spherical_harmonics as sh
-from .pilot import noise_beside, relative
+from .pilot import error_by_twins, noise_beside, relative
 
 
 def nearest(was: NDArray, moved: NDArray, one: NDArray, two: NDArray) -> tuple[NDArray, NDArray]:
@@ -47,13 +47,12 @@ def error_at(blocked: NDArray, was: NDArray, rays: int, one: NDArray, two: NDArr
         blocked: (s, K), the answer. was: (s, K), what was traced with `rays` rays for it.
         one, two: (s, K), with `traced` rays. open_sky: (s, K) unshadowed transfer.
     """
-    here = ((blocked - one) * (blocked - two)).sum(1)
-    squared, least = float(here.sum()), float(np.square(here).sum()) ** 0.5
-    if rays > traced:
-        plain = ((was - one) * (was - two)).sum(1)
-        apart, off = plain - plain.mean(), here - here.mean()
-        noise = float(np.square(one - two).sum()) / 2 * noise_beside(traced, rays) ** 2
-        share = float(np.clip(apart @ off / max(apart @ apart, 1e-300), 0, 1))
-        squared -= share * (float(plain.sum()) - noise)
-        least = float(np.square(off - share * apart).sum()) ** 0.5
+    if rays <= traced:
+        return error_by_twins(blocked, one, two, open_sky)
+    here, plain = (((answer - one) * (answer - two)).sum(1) for answer in (blocked, was))
+    apart, off = plain - plain.mean(), here - here.mean()
+    noise = float(np.square(one - two).sum()) / 2 * noise_beside(traced, rays) ** 2
+    share = float(np.clip(apart @ off / max(apart @ apart, 1e-300), 0, 1))
+    squared = float(here.sum()) - share * (float(plain.sum()) - noise)
+    least = float(np.square(off - share * apart).sum()) ** 0.5
     return relative(max(squared, least), ((open_sky - one) * (open_sky - two)).sum(1), open_sky)

@@ -21,14 +21,13 @@ from numpy.typing import NDArray
 
 from . import embree_bake, hybrid_bake
 from . import spherical_harmonics as sh
-from .estimator import MAX_RAYS, RATE, BlockedEstimator, morton_order
+from .estimator import MAX_RAYS, RATE, blocked_at, morton_order, places_along
 from .geometry import TriangleMesh
-from .hybrid import levelled
-from .pilot import DENSE, Apart, Pilot, dark, relative
+from .hybrid import dot, levelled
+from .pilot import DENSE, Apart, Pilot, dark, error_by_twins
 from .progress import scaled
 from .raycast import Geometry, Occluders
 from .record import BakeRecord
-from .shares import error_at
 from .transfer import Transfer
 from .workers import default_threads, workers
 
@@ -114,21 +113,16 @@ def tried(mesh: TriangleMesh, scene: Occluders, order: int, pilot: Pilot, tolera
     """
     lit = mesh.lit()
     lit = lit[curve(mesh.points[lit], mesh.normals[lit])]
-    place = np.zeros(len(mesh.points), np.int64)
-    place[lit] = np.arange(len(lit))
     some, rng = pilot.some(len(lit)), np.random.default_rng([seed, 7])
-    wanted = place[pilot.sample[0][some]]
+    wanted = places_along(lit, len(mesh.points))[pilot.sample[0][some]]
     first = wanted - rng.integers((WINDOW // 2 - 1) * _TRIED, WINDOW // 2 * _TRIED, len(wanted))
     at = np.clip(first, 0, len(lit) - WINDOW * _TRIED)[:, None] + np.arange(0, WINDOW * _TRIED, _TRIED)
-    rows, every = lit[at.ravel()], np.arange(at.size)
-    few = replace(mesh, points=mesh.points[rows], normals=mesh.normals[rows], clearance=mesh.clearance[rows])
+    rows = lit[at.ravel()]
     rays = _rays(pilot.noise_of(_HELD_RAYS), _MARGIN * tolerance)
-    estimator = BlockedEstimator(few, scene, order, int(rng.integers(2**31)), rays)
-    sums = np.zeros((len(rows), sh.coefficient_count(order)))
-    yield from estimator.trace(pool, threads, every, 0, rays, sums)
-    values = levelled(estimator.blocked(pool, every, sums, rays), sh.cosine_lobe(few.normals, order), -1)
-    samples, here = Samples.at(scene.normalise(few.points), few.normals, values), lit[wanted]
-    read = samples.read(every.reshape(at.shape).T, scene.normalise(mesh.points[here]), mesh.normals[here])
+    blocked = yield from blocked_at(mesh, rows, scene, order, int(rng.integers(2**31)), rays, pool, threads)
+    values = levelled(blocked, sh.cosine_lobe(mesh.normals[rows], order), -1)
+    samples, here = Samples.at(scene.normalise(mesh.points[rows]), mesh.normals[rows], values), lit[wanted]
+    read = samples.read(np.arange(at.size).reshape(at.shape).T, scene.normalise(mesh.points[here]), mesh.normals[here])
     return replace(pilot, apart=Apart(some, levelled(read, pilot.unshadowed[some], 1), lit),
                    traced=pilot.traced + rays * len(rows))
 
@@ -138,7 +132,7 @@ def expected_rays(pilot: Pilot, points: int, tolerance: float) -> float:
     assert pilot.apart is not None
     some, read = pilot.apart.points, pilot.apart.read
     one, two = (trace[some] for trace in pilot.sample[1:])
-    error = error_at(read, read, 0, one, two, pilot.rays, pilot.unshadowed[some])
+    error = error_by_twins(read, one, two, pilot.unshadowed[some])
     if error is None:
         return np.inf
     goal = _MARGIN * tolerance
@@ -186,12 +180,12 @@ class Samples:
         for square, chosen in zip(squares, which, strict=True):
             away = self.places.take(chosen, 1)
             away -= here
-            np.square(_dot(away, normal), out=square)
+            np.square(dot(away, normal), out=square)
             square *= np.float32(_HEIGHT)
-            square += _dot(away, away)
+            square += dot(away, away)
             turned = self.facing.take(chosen, 1)
             turned -= normal
-            square += np.float32(_TURN ** 2 / 2) * _dot(turned, turned)  # 1 - cosine, exact where that is 0
+            square += np.float32(_TURN ** 2 / 2) * dot(turned, turned)  # 1 - cosine, exact where that is 0
         squares /= np.maximum(squares.mean(0), np.float32(_LEAST))
         squares += np.float32(SOFT)
         weights = 1 / np.square(squares, out=squares)
@@ -202,14 +196,6 @@ class Samples:
             part *= weight
             out += part
         return out.T
-
-
-def _dot(one: NDArray, two: NDArray) -> NDArray:
-    """Of vectors (3, n)."""
-    out = one[0] * two[0]
-    for a, b in zip(one[1:], two[1:], strict=True):
-        out += a * b
-    return out
 
 
 def beside(samples: NDArray, wanted: NDArray) -> NDArray[np.int64]:
@@ -243,9 +229,8 @@ class _Work:
         count = len(self._lit)
         known = None
         if pilot is not None and np.isfinite(pilot.noise):
-            noise, place = pilot.noise_of(_HELD_RAYS), np.zeros(len(self._mesh.points), np.int64)
-            place[self._lit] = np.arange(count)
-            known = place[pilot.sample[0]], *pilot.sample[1:]
+            noise = pilot.noise_of(_HELD_RAYS)
+            known = places_along(self._lit, len(self._mesh.points))[pilot.sample[0]], *pilot.sample[1:]
         else:
             held = yield from self._held(np.arange(count))
             noise = self._noise(*held)  # of _HELD_RAYS, relative
@@ -352,16 +337,9 @@ class _Work:
         return points, one, two
 
     def _error(self, points: NDArray, one: NDArray, two: NDArray) -> float | None:
-        """Relative L2 error at points that were traced twice; None in the dark, or where it can hardly be told.
-
-        Both traces' noise is independent, so it cancels in the product. An error that is too small to be told from the
-        standard error of its square is said to be as large as that.
-        """
+        """Relative L2 error at points that were traced twice; None in the dark, or where it can hardly be told."""
         unshadowed = self._unshadowed(points)
-        blocked = self._at(points, unshadowed)
-        squares = ((blocked - one) * (blocked - two)).sum(1)
-        least = float(np.square(squares).sum()) ** 0.5
-        return relative(max(float(squares.sum()), least), ((unshadowed - one) * (unshadowed - two)).sum(1), unshadowed)
+        return error_by_twins(self._at(points, unshadowed), one, two, unshadowed)
 
     def _noise(self, points: NDArray, one: NDArray, two: NDArray) -> float:
         """Relative error of one of two traces, from how they differ; 0 in the dark."""
@@ -371,10 +349,6 @@ class _Work:
 
     def _traced(self, points: NDArray, rays: int) -> Generator[float, None, NDArray]:
         """The blocked part (n, K) at some points, with rays of their own."""
-        chosen, mesh = self._lit[points], self._mesh
-        few = replace(mesh, points=mesh.points[chosen], normals=mesh.normals[chosen], clearance=mesh.clearance[chosen])
-        estimator = BlockedEstimator(few, self._scene, self._order, int(self._rng.integers(2**31)), rays)
-        rows = np.arange(len(points))
-        sums = np.zeros((len(points), sh.coefficient_count(self._order)))
-        yield from estimator.trace(self._pool, self._threads, rows, 0, rays, sums)
-        return estimator.blocked(self._pool, rows, sums, rays).astype(np.float64)
+        blocked = yield from blocked_at(self._mesh, self._lit[points], self._scene, self._order,
+                                        int(self._rng.integers(2**31)), rays, self._pool, self._threads)
+        return blocked.astype(np.float64)
